@@ -1,0 +1,37 @@
+"""What can go wrong, each with the way out in its message."""
+
+
+class HqpGraspError(Exception):
+    """Any error that hqp_grasp raises on purpose."""
+
+
+class InputError(HqpGraspError, ValueError):
+    """An argument is malformed: a wrong shape, a NaN, an unknown name, crossed bounds."""
+
+
+class ModelError(HqpGraspError, ValueError):
+    """A robot model lacks something its description names, or breaks a rule models must keep."""
+
+
+class SolverError(HqpGraspError, RuntimeError):
+    """No method found an answer that passes the optimality certificate."""
+
+
+class ResultsError(HqpGraspError, OSError):
+    """A results folder cannot be written, or belongs to another configuration."""
+
+
+class ReachError(HqpGraspError, RuntimeError):
+    """No starting posture touches the object: it is out of the hand's reach."""
+
+
+class SingularTaskError(HqpGraspError, ArithmeticError):
+    """A control law is undefined at this grasp, for a reason that the message names."""
+
+
+def one_of(name: str, value: object, choices: object) -> str:
+    """Return `value` if it is among `choices`, else raise InputError listing them."""
+    valid = [str(c) for c in choices]  # type: ignore[attr-defined]
+    if value not in valid:
+        raise InputError(f"unknown {name} {value!r}; choose one of: {', '.join(valid)}")
+    return str(value)

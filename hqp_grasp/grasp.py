@@ -1,0 +1,141 @@
+"""What touch told us: the contacts of a hand on an object, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hqp_grasp.errors import InputError
+
+UNIT_NORMAL_TOLERANCE = 1e-6  # | ‖n‖ − 1 | accepted in a sensed normal
+
+
+def as_array(name: str, value: object, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Return `value` as a finite float array of `shape` (None: any length), else raise InputError."""
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be an array of numbers; got {value!r}") from error
+    matches = array.ndim == len(shape) and all(
+        want is None or want == got for want, got in zip(shape, array.shape, strict=True)
+    )
+    if not matches:
+        wanted = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
+        raise InputError(f"{name} must have shape {wanted}; got {array.shape}")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(f"{name} must be finite; entry {where} is {array[where]}")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """One place where the hand touches the object.
+
+    Everything after `normal` is optional: a law that needs it says so. A contact belongs to a
+    body, not to a finger: any link of any robot can hold one.
+    """
+
+    position: np.ndarray  # (3,) [m], world
+    normal: np.ndarray  # (3,) unit, outward from the object, world
+    name: str = ""  # the robot's contact point that touches
+    body: str = ""  # the link it belongs to
+    point: np.ndarray | None = None  # (3,) [m], body frame: the point whose motion `jacobian` gives
+    flexion: tuple[int, ...] = ()  # γ_i: indices into q of the joints that press this contact
+    tip_radius: float = 0.0  # [m] from `point` to the touching surface; 0 for a material point
+    wrench: np.ndarray | None = None  # (6,) force [N], torque [N·m] on the tip, when sensed
+    confidence: float = 1.0  # 0 … 1
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        set_field(self, "position", as_array("Contact.position", self.position, (3,)))
+        normal = as_array("Contact.normal", self.normal, (3,))
+        length = float(np.linalg.norm(normal))
+        if abs(length - 1.0) > UNIT_NORMAL_TOLERANCE:
+            raise InputError(f"Contact.normal must be a unit vector; its length is {length:.9g}")
+        set_field(self, "normal", normal)
+        if self.point is not None:
+            set_field(self, "point", as_array("Contact.point", self.point, (3,)))
+        if self.wrench is not None:
+            set_field(self, "wrench", as_array("Contact.wrench", self.wrench, (6,)))
+        set_field(self, "flexion", tuple(int(i) for i in self.flexion))
+        if not (np.isfinite(self.tip_radius) and self.tip_radius >= 0.0):
+            raise InputError(f"Contact.tip_radius must be ≥ 0 [m]; got {self.tip_radius}")
+        if not 0.0 <= self.confidence <= 1.0:
+            raise InputError(f"Contact.confidence must lie in [0, 1]; got {self.confidence}")
+
+
+@dataclass(frozen=True, eq=False)
+class Grasp:
+    """A hand posture and the k contacts felt there.
+
+    `jacobian` stacks ∂x_i/∂q over the contacts (paper, eq. 12); `hessian[a, j, l]` is
+    ∂²x_a/∂q_j∂q_l of the same 3k coordinates. x_i is the point whose motion carries contact i:
+    for a round fingertip the centre of the sphere, `tip_radius` away from the touching surface.
+    """
+
+    q: np.ndarray  # (n,) independent joints [rad]
+    contacts: tuple[Contact, ...]  # k of them
+    jacobian: np.ndarray  # (3k, n) [m/rad], world
+    hessian: np.ndarray | None = None  # (3k, n, n) [m/rad²], world
+    coupling: np.ndarray | None = None  # C (N, n): q_full = C q + c₀; identity when None
+    offset: np.ndarray | None = None  # c₀ (N,); zero when None
+    _J3: np.ndarray = field(init=False, repr=False)  # (k, 3, n) view of jacobian
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        q = as_array("Grasp.q", self.q, (None,))
+        n = len(q)
+        contacts = tuple(self.contacts)
+        if not contacts:
+            raise InputError("Grasp.contacts is empty: a grasp has at least one contact")
+        for contact in contacts:
+            if not isinstance(contact, Contact):
+                raise InputError(f"Grasp.contacts holds {contact!r}; it must hold Contact values")
+            for i in contact.flexion:
+                if not 0 <= i < n:
+                    raise InputError(f"Contact.flexion index {i} is outside 0 … {n - 1}")
+        k = len(contacts)
+        jacobian = as_array("Grasp.jacobian", self.jacobian, (3 * k, n))
+        if self.hessian is not None:
+            set_field(self, "hessian", as_array("Grasp.hessian", self.hessian, (3 * k, n, n)))
+        coupling = np.eye(n) if self.coupling is None else self.coupling
+        coupling = as_array("Grasp.coupling", coupling, (None, n))
+        offset = np.zeros(len(coupling)) if self.offset is None else self.offset
+        set_field(self, "offset", as_array("Grasp.offset", offset, (len(coupling),)))
+        set_field(self, "coupling", coupling)
+        set_field(self, "q", q)
+        set_field(self, "contacts", contacts)
+        set_field(self, "jacobian", jacobian)
+        set_field(self, "_J3", jacobian.reshape(k, 3, n))
+
+    @property
+    def k(self) -> int:
+        """Number of contacts."""
+        return len(self.contacts)
+
+    @property
+    def n(self) -> int:
+        """Number of independent joints."""
+        return len(self.q)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Contact positions (k, 3) [m], world."""
+        return np.array([c.position for c in self.contacts])
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals (k, 3), world."""
+        return np.array([c.normal for c in self.contacts])
+
+    @property
+    def q_full(self) -> np.ndarray:
+        """All joints of the model, C q + c₀ (N,) [rad]."""
+        return self.coupling @ self.q + self.offset  # type: ignore[operator]
+
+    def contact_jacobian(self, i: int) -> np.ndarray:
+        """∂x_i/∂q (3, n) [m/rad] of contact i."""
+        return self._J3[i]

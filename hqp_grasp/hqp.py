@@ -1,0 +1,257 @@
+"""The strict hierarchy of least-squares problems with inequalities, solved exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import daqp
+import numpy as np
+import proxsuite
+import qpsolvers
+
+from hqp_grasp import active_set
+from hqp_grasp.errors import InputError, SolverError, one_of
+from hqp_grasp.level import (
+    CERTIFICATE_TOLERANCE,
+    Level,
+    LevelReport,
+    Solution,
+    Stacked,
+    optimality_faults,
+    stack,
+)
+
+QUICK_ROUNDS = 8  # rounds of the active-set search before the backend is asked
+POLISH_ROUNDS = 20  # rounds allowed to settle the active set that a backend names
+PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method
+BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
+STRONG = 1e-6  # [–] scaled slack or dual above which a backend's row counts as active
+RIDGE = 1e-9  # [–] added to a backend's Hessian; its answer only names the active set
+
+
+class _BackendFailure(Exception):
+    """A QP solver did not solve one level; the message says how it reported that."""
+
+
+Backend = Callable[
+    [np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]
+]
+
+
+def solvers() -> tuple[str, ...]:
+    """Names that HQP accepts: proxqp and daqp through their own interfaces, the rest qpsolvers'."""
+    return ("proxqp", "daqp", *(s for s in qpsolvers.available_solvers if s not in OWN_INTERFACE))
+
+
+@dataclass(frozen=True)
+class HQP:
+    """Strict lexicographic least squares: each level as nearly as those above allow.
+
+    An answer is found by the first of these ways that passes the optimality certificate: the
+    equalities alone or the warm start's active set, settled by a few rounds of exact active-set
+    steps (`shortcuts`); the QP solver, level by level in the freedom left, its active set
+    settled likewise; the exact one-row-at-a-time method. Solution.method names the way,
+    Solution.failed the ways before it. Where several x are optimal the shortest is returned.
+    """
+
+    solver: str = "proxqp"  # one of solvers()
+    rank_tolerance: float | None = None  # [–] σ counts above this × ‖A_k‖₂; None: max(m, n)·eps
+    shortcuts: bool = True  # False: every call goes through the QP solver
+
+    def __post_init__(self) -> None:
+        one_of("solver", self.solver, solvers())
+        if self.rank_tolerance is not None and not 0.0 <= self.rank_tolerance < 1.0:
+            raise InputError(f"rank_tolerance must lie in [0, 1); got {self.rank_tolerance}")
+
+    def solve(self, levels: Sequence[Level], warm: Solution | None = None) -> Solution:
+        """Return the optimum of `levels`, first level first.
+
+        `warm`: the solution of a similar hierarchy, whose active set is tried first.
+        Raises InputError for levels that disagree on the number of unknowns, and SolverError
+        where no way leads to an answer that passes its certificate.
+        """
+        rows = stack(levels)
+        equalities = np.where(rows.equal, 2, 0).astype(np.int8)
+        failed: list[str] = []
+        if self.shortcuts:
+            act = equalities.copy()
+            if warm is not None and len(warm.active) == len(act):
+                act = np.where(rows.equal, 2, np.where(warm.active == 2, 0, warm.active))
+                act = _possible(act.astype(np.int8), rows)
+            found = self._settle(levels, rows, act, "shortcut", failed, QUICK_ROUNDS, 0)
+            if found is not None:
+                return found
+        try:
+            act = _cascade(rows, OWN_INTERFACE.get(self.solver) or _through_qpsolvers(self.solver))
+        except _BackendFailure as failure:
+            failed.append(f"{self.solver}: {failure}")
+        else:
+            found = self._settle(levels, rows, act, self.solver, failed, POLISH_ROUNDS, 0)
+            if found is not None:
+                return found
+        pivots = PIVOTS_PER_ROW * (len(rows.A) + rows.A.shape[1])
+        act = equalities.copy()
+        found = self._settle(levels, rows, act, "one row at a time", failed, 0, pivots)
+        if found is not None:
+            return found
+        raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
+
+    def _settle(
+        self,
+        levels: Sequence[Level],
+        rows: Stacked,
+        act: np.ndarray,
+        method: str,
+        failed: list[str],
+        rounds: int,
+        pivots: int,
+    ) -> Solution | None:
+        """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
+        x, w, multipliers, rank, _, _ = active_set.search(
+            rows.A,
+            rows.lower,
+            rows.upper,
+            rows.offsets,
+            act,
+            rows.frobenius,
+            rows.row_norm,
+            -1.0 if self.rank_tolerance is None else self.rank_tolerance,
+            rounds,
+            pivots,
+        )
+        n = rows.A.shape[1]
+        tol = CERTIFICATE_TOLERANCE
+        faults = optimality_faults(rows, x, multipliers, tol, least_norm=bool(rank.sum() < n))
+        if faults:
+            failed.append(f"{method}: {faults[0]}")
+            return None
+        value = rows.A @ x
+        residual = value - np.clip(value, rows.lower, rows.upper)
+        room = tol * (np.abs(value) + rows.row_norm * float(np.linalg.norm(x)))
+        unmet = np.abs(residual) > room
+        reports = []
+        for k, level in enumerate(levels):
+            own = slice(rows.offsets[k], rows.offsets[k + 1])
+            status = "nearest" if unmet[own].any() else "met"
+            reports.append(LevelReport(level.name, residual[own], int(rank[k]), status))
+        return Solution(x, tuple(reports), act, multipliers[:, :-1], method, tuple(failed))
+
+
+def _possible(act: np.ndarray, rows: Stacked) -> np.ndarray:
+    """Let go of rows held at a bound that is infinite."""
+    infinite = ((act == 1) & np.isinf(rows.upper)) | ((act == -1) & np.isinf(rows.lower))
+    act[infinite] = 0
+    return act
+
+
+def _cascade(rows: Stacked, backend: Backend) -> np.ndarray:
+    """Let a QP solver name the active rows, level by level in the freedom that is left.
+
+    Equalities, rows that cannot be met and rows held by a strong dual are frozen for the levels
+    below; the others stay inequalities. Returns act (M,), to be settled exactly.
+    """
+    A, n = rows.A, rows.A.shape[1]
+    act = np.zeros(len(A), dtype=np.int8)
+    unit = np.where(rows.row_norm > 0.0, rows.row_norm, 1.0)
+    x = np.zeros(n)
+    Z = np.eye(n)
+    standing = np.zeros(0, dtype=int)  # inequality rows above that are met and not frozen
+    p = len(rows.frobenius)
+    for k in range(p + 1):
+        own = np.arange(rows.offsets[k], rows.offsets[k + 1]) if k < p else np.zeros(0, dtype=int)
+        own = own[~(np.isinf(rows.lower[own]) & np.isinf(rows.upper[own]))]
+        equal, soft = own[rows.equal[own]], own[~rows.equal[own]]
+        act[equal] = 2
+        d, slacks = Z.shape[1], len(soft)
+        duals = np.zeros(len(standing))
+        if d:
+            scale = rows.frobenius[k] if k < p and rows.frobenius[k] > 0.0 else 1.0
+            M = (A[equal] @ Z if k < p else Z) / scale
+            r = (A[equal] @ x - rows.upper[equal] if k < p else x) / scale
+            P = np.zeros((d + slacks, d + slacks))
+            P[:d, :d] = M.T @ M
+            P[d:, d:] = np.diag((unit[soft] / scale) ** 2)
+            P[np.arange(d), np.arange(d)] += RIDGE
+            q = np.concatenate([M.T @ r, np.zeros(slacks)])
+            both = np.concatenate([standing, soft])
+            G = np.zeros((len(both), d + slacks))
+            G[:, :d] = A[both] @ Z / unit[both, None]
+            G[len(standing) :, d:] = -np.eye(slacks)
+            base = A[both] @ x
+            y, z = backend(
+                P, q, G, (rows.lower[both] - base) / unit[both], (rows.upper[both] - base) / unit[both]
+            )
+            if not (np.isfinite(y).all() and np.isfinite(z).all()):
+                raise _BackendFailure(f"level {k}: answer is not finite")
+            x = x + Z @ y[:d]
+            duals = z[: len(standing)]
+        value = A[soft] @ x
+        over = (value - np.clip(value, rows.lower[soft], rows.upper[soft])) / unit[soft]
+        size = 1.0 + float(np.linalg.norm(x))
+        broken = np.abs(over) > STRONG * size
+        act[soft[broken]] = np.sign(over[broken])
+        held = np.abs(duals) > STRONG * (1.0 + np.abs(duals).max(initial=0.0))
+        act[standing[held]] = np.sign(duals[held])
+        frozen = np.concatenate([equal, soft[broken], standing[held]])
+        standing = np.concatenate([standing[~held], soft[~broken]])
+        if d and len(frozen):
+            rest = A[frozen] @ Z / unit[frozen, None]
+            _, sigma, Vt = np.linalg.svd(rest)
+            Z = Z @ Vt[int((sigma > 1e-9).sum()) :].T
+    return _possible(act, rows)
+
+
+def _proxqp(
+    P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    qp = proxsuite.proxqp.dense.QP(len(q), 0, len(G))
+    qp.settings.eps_abs = BACKEND_EPS
+    qp.settings.eps_rel = 0.0
+    qp.settings.eps_primal_inf = 1e-12  # the default calls feasible cascades infeasible
+    qp.settings.eps_dual_inf = 1e-12
+    qp.settings.max_iter = 1000
+    qp.init(P, q, None, None, G, np.maximum(lower, -1e20), np.minimum(upper, 1e20))
+    qp.solve()
+    status = qp.results.info.status
+    if status != proxsuite.proxqp.PROXQP_SOLVED:
+        raise _BackendFailure(f"status {status.name}")
+    return np.array(qp.results.x), np.array(qp.results.z)
+
+
+def _daqp(
+    P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    sense = np.zeros(len(G), dtype=np.int32)
+    x, _, flag, info = daqp.solve(
+        P, q, G, np.minimum(upper, 1e30), np.maximum(lower, -1e30), sense, primal_tol=BACKEND_EPS
+    )
+    if flag < 1:
+        raise _BackendFailure(f"exit flag {flag}")
+    return np.array(x), np.array(info["lam"])
+
+
+def _through_qpsolvers(name: str) -> Backend:
+    def solve(
+        P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        has_upper, has_lower = np.isfinite(upper), np.isfinite(lower)
+        sides = np.concatenate([G[has_upper], -G[has_lower]])
+        bounds = np.concatenate([upper[has_upper], -lower[has_lower]])
+        problem = qpsolvers.Problem(P, q, sides, bounds) if len(sides) else qpsolvers.Problem(P, q)
+        try:
+            answer = qpsolvers.solve_problem(problem, name)
+        except (qpsolvers.exceptions.QPError, ValueError, ArithmeticError) as error:
+            raise _BackendFailure(f"{type(error).__name__}: {error}") from error
+        if not answer.found or answer.x is None:
+            raise _BackendFailure("no solution found")
+        z = np.zeros(len(G))
+        if len(sides) and answer.z is not None:
+            z[has_upper] += answer.z[: has_upper.sum()]
+            z[has_lower] -= answer.z[has_upper.sum() :]
+        return np.asarray(answer.x), z
+
+    return solve
+
+
+OWN_INTERFACE: dict[str, Backend] = {"proxqp": _proxqp, "daqp": _daqp}

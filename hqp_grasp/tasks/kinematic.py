@@ -1,0 +1,208 @@
+"""The kinematic law: each finger's flexion should push along the normal of its contact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hqp_grasp.errors import InputError, SingularTaskError, one_of
+from hqp_grasp.grasp import Grasp
+from hqp_grasp.tasks.task import Task
+
+ALIGNED = 1e-9  # [rad] nearer to its minimum than this, an error has no direction of descent
+STILL = 1e-9  # [m/rad] flexion joints that move their contact slower than this do not move it
+EQUAL_SPEEDS = 1e-6  # [–] relative difference of two singular values below which they are equal
+
+
+@dataclass(frozen=True, init=False)
+class KinematicTask(Task):
+    """How far each flexion is from moving its contact along the normal (paper, section 2.3).
+
+    With J_γ = ∂x_i/∂γ_i (3, g), the columns of contact i's Jacobian for its flexion joints γ_i:
+
+    - error="angle": ε_i = arccos(|n·J_γ|/|J_γ|) [rad] for one joint; for several, the angle
+      between n and the leading left singular vector of J_γ, the major axis of the velocity
+      ellipsoid and so the minor axis of the force ellipsoid. This is what section 2.3 asks for
+      and what Figure 3 plots.
+    - error="eq7": ε_i = (nᵀ J_γ J_γᵀ n)^½ [m/rad] (paper, eq. 7–8). Descending it does the
+      opposite: the flexion turns tangent to the surface.
+
+    `potential` is their sum ε_c and `gradient` its slope (paper, eq. 8–9). As in eq. 9 the contact
+    is a point of the hand, and its normal is held fixed.
+
+    - form="rows": one Newton row per contact, J_i x = −gain·ε_i, with gain [–].
+    - form="gradient": the paper's dq_c ∝ −∂ε_c/∂q as a level of n rows, x = −gain·∂ε_c/∂q. It
+      fixes every joint, so nothing below it is felt. Here gain has the unit rad²/(unit of ε):
+      rad for "angle", rad³/m for "eq7".
+    """
+
+    kind: str  # "angle" or "eq7"
+    form: str  # "rows" or "gradient"
+
+    # Written by hand because the keyword is called error, and so is the method: the choice is
+    # stored as `kind`. After this the task is as frozen as any other.
+    def __init__(
+        self,
+        error: str = "angle",
+        form: str = "rows",
+        *,
+        gain: float = 1.0,
+        weight: float = 1.0,
+    ) -> None:
+        set_field = object.__setattr__
+        set_field(self, "kind", one_of("KinematicTask error", error, ["angle", "eq7"]))
+        set_field(self, "form", one_of("KinematicTask form", form, ["rows", "gradient"]))
+        set_field(self, "gain", gain)
+        set_field(self, "weight", weight)
+        self.__post_init__()
+
+    def __repr__(self) -> str:
+        return (
+            f"KinematicTask(error={self.kind!r}, form={self.form!r}, "
+            f"gain={self.gain!r}, weight={self.weight!r})"
+        )
+
+    def error(self, grasp: Grasp) -> np.ndarray:
+        """ε_i of each contact (k,), [rad] for "angle", [m/rad] for "eq7"."""
+        return self._error_and_slope(grasp, _flexion_columns(grasp))[0]
+
+    def jacobian(self, grasp: Grasp) -> np.ndarray:
+        """∂ε_i/∂q (k, n): the terms of eq. 9, for γ_i of any dimension.
+
+        For one flexion joint and "eq7" this is eq. 10 with the sign(n·J_γ) that it lacks. A row
+        is zero where its error is at its minimum, 0 (there ε_i has a kink and zero is one of its
+        subgradients); elsewhere it stays bounded. At |n·J_γ| = 0 the angle has its maximum, also
+        a kink, and the row is one of the two one-sided slopes, so that descent leaves it.
+        """
+        return self._error_and_jacobian(grasp)[1]
+
+    def potential(self, grasp: Grasp) -> float:
+        """ε_c = Σ ε_i (paper, eq. 8)."""
+        return float(self.error(grasp).sum())
+
+    def gradient(self, grasp: Grasp) -> np.ndarray:
+        """∂ε_c/∂q (n,) (paper, eq. 9)."""
+        return self.jacobian(grasp).sum(axis=0)
+
+    def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
+        """The equality rows (A, b) asked of x = Δq: see `form` in the class's description."""
+        if self.form == "gradient":
+            b = (-self.weight * self.gain) * self.gradient(grasp)
+            return self.weight * np.eye(grasp.n), b
+        e, J = self._error_and_jacobian(grasp)
+        return self.weight * J, (-self.weight * self.gain) * e
+
+    def _error_and_jacobian(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
+        """ε (k,) and ∂ε/∂q (k, n) = Σ over the entries of J_γ of ∂ε/∂J_γ · ∂J_γ/∂q."""
+        if grasp.hessian is None:
+            raise InputError(
+                "KinematicTask.jacobian needs second derivatives: build the Grasp with "
+                f"hessian = ∂²x/∂q² of shape {(3 * grasp.k, grasp.n, grasp.n)}"
+            )
+        k, n = grasp.k, grasp.n
+        gamma = _flexion_columns(grasp)
+        e, slope = self._error_and_slope(grasp, gamma)
+        dJ_gamma = grasp.hessian.reshape(k, 3, n, n)[np.arange(k)[:, None], :, gamma]  # (k,g,3,n)
+        J = slope.reshape(k, 1, -1) @ dJ_gamma.reshape(k, -1, n)  # (k, 1, n)
+        return e, J[:, 0]
+
+    def _error_and_slope(self, grasp: Grasp, gamma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """ε (k,) and ∂ε/∂J_γᵀ (k, g, 3)."""
+        # J_γᵀ of every contact (k, g, 3). A repeated index pads γ_i; its row is set to zero,
+        # which changes neither error, and makes its slope zero too.
+        JT = grasp._J3[np.arange(grasp.k)[:, None], :, gamma]
+        if gamma.shape[1] > 1:
+            JT[:, 1:][gamma[:, 1:] == gamma[:, :-1]] = 0.0
+        if self.kind == "eq7":
+            return _eq7(grasp.normals, JT)
+        return _angle(grasp, JT)
+
+
+def _flexion_columns(grasp: Grasp) -> np.ndarray:
+    """γ_i of every contact as one array (k, g): sorted, its last index repeated to length g."""
+    sets = [sorted(set(c.flexion)) for c in grasp.contacts]
+    for i, gamma in enumerate(sets):
+        if not gamma:
+            raise InputError(
+                f"KinematicTask: {_label(grasp, i)} has no flexion joint; give Contact.flexion "
+                "the indices into q of the joints that press it"
+            )
+    g = max(map(len, sets))
+    return np.array([gamma + gamma[-1:] * (g - len(gamma)) for gamma in sets])
+
+
+def _eq7(normals: np.ndarray, JT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """ε = |J_γᵀ n| and its slope ∂ε/∂J_γᵀ = (J_γᵀ n/ε) nᵀ (paper, eq. 7 and 9)."""
+    w = (JT @ normals[:, :, None])[:, :, 0]  # (k, g): speed along the normal, joint by joint
+    e = np.sqrt((w * w).sum(axis=1))
+    speed = np.sqrt((JT * JT).sum(axis=(1, 2)))
+    moves = e > ALIGNED * speed
+    unit = w * (moves / np.where(moves, e, 1.0))[:, None]
+    return e, unit[:, :, None] * normals[:, None, :]
+
+
+def _angle(grasp: Grasp, JT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angle ε between n and u, the leading left singular vector of J_γ, and ∂ε/∂J_γᵀ.
+
+    t = (n − (n·u)u)/sin ε turns u towards n: dε = −sign(n·u) t·du. With λ_j the squares of the
+    singular values, du = P (dJ_γ J_γᵀ + J_γ dJ_γᵀ) u, P = Σ_{j≥2} u_j u_jᵀ/(λ_1 − λ_j).
+    """
+    normals = grasp.normals
+    if JT.shape[1] == 1:  # one joint: λ_2 = λ_3 = 0
+        sigma = np.sqrt((JT * JT).sum(axis=2))  # (k, 1)
+        _refuse_still(grasp, sigma[:, 0])
+        u = JT[:, 0] / sigma
+        t, e, sign = _turn(normals, u)
+        return e, (t * (-sign[:, None] / sigma))[:, None, :]
+    _, sigma, axes = np.linalg.svd(JT)  # rows of axes (k, 3, 3): u_1, u_2, u_3
+    _refuse_still(grasp, sigma[:, 0])
+    _refuse_equal_speeds(grasp, sigma)
+    lam = np.zeros((len(JT), 3))
+    lam[:, : sigma.shape[1]] = sigma**2
+    u = axes[:, 0]
+    t, e, sign = _turn(normals, u)
+    minor = axes[:, 1:]
+    y = (minor @ t[:, :, None])[:, :, 0] / (lam[:, :1] - lam[:, 1:])
+    Pt = (y[:, None, :] @ minor)[:, 0]  # (k, 3)
+    JTu, JTPt = JT @ u[:, :, None], JT @ Pt[:, :, None]  # (k, g, 1)
+    return e, -sign[:, None, None] * (JTu * Pt[:, None, :] + JTPt * u[:, None, :])
+
+
+def _turn(n: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit t ⟂ u towards n, or zero where n ∥ u; the angle in [0, π/2]; sign(n·u), never 0."""
+    cosine = (n * u).sum(axis=1)
+    t = n - cosine[:, None] * u
+    sine = np.sqrt((t * t).sum(axis=1))
+    turned = sine > ALIGNED
+    t *= (turned / np.where(turned, sine, 1.0))[:, None]
+    return t, np.arctan2(sine, np.abs(cosine)), np.copysign(1.0, cosine)
+
+
+def _refuse_still(grasp: Grasp, speed: np.ndarray) -> None:
+    """Raise where the flexion joints do not move their contact: no angle is defined."""
+    if speed.min() <= STILL:
+        i = int(speed.argmin())
+        raise SingularTaskError(
+            f"{_label(grasp, i)}: its flexion joints {grasp.contacts[i].flexion} do not move it "
+            f"({speed[i]:.1e} m/rad), so its angle to the normal is undefined; check "
+            "Contact.flexion, or use KinematicTask(error='eq7')"
+        )
+
+
+def _refuse_equal_speeds(grasp: Grasp, sigma: np.ndarray) -> None:
+    """Raise where two singular values lead: the flexion then has no one direction."""
+    equal = sigma[:, 0] - sigma[:, 1] <= EQUAL_SPEEDS * sigma[:, 0]
+    if equal.any():
+        i = int(equal.argmax())
+        raise SingularTaskError(
+            f"{_label(grasp, i)}: its flexion joints {grasp.contacts[i].flexion} move it equally "
+            f"fast in two directions ({sigma[i, 0]:.6g} m/rad), so its angle to the normal is "
+            "undefined; leave fewer joints in Contact.flexion, or use KinematicTask(error='eq7')"
+        )
+
+
+def _label(grasp: Grasp, i: int) -> str:
+    """Contact i, as an error message calls it."""
+    name = grasp.contacts[i].name
+    return f"contact {i} ({name!r})" if name else f"contact {i}"

@@ -1,0 +1,148 @@
+"""Seeded random hierarchies: lists of (A, lower, upper), most important level first."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Rows(NamedTuple):
+    """One level: lower ≤ A x ≤ upper. A plain tuple that also answers to .A, .lower, .upper."""
+
+    A: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def equal(A, b):
+    """Rows that ask for A x = b."""
+    b = np.array(b, dtype=float)
+    return Rows(np.array(A, dtype=float), b, b.copy())
+
+
+def box(n, bound):
+    """Rows that keep every component of x within ±bound."""
+    return Rows(np.eye(n), np.full(n, -bound), np.full(n, bound))
+
+
+# Standard deviation of the targets, per difficulty. A box of ±0.25 lets a Gaussian row of 11
+# entries reach about ±2.2.
+AMPLITUDE = {"easy": 0.1, "mid": 0.7, "hard": 1.0}
+
+
+def three_level(rng, difficulty):
+    """n = 11: a box, then three Gaussian tasks of 3, 3 and 11 equality rows."""
+    n, amplitude = 11, AMPLITUDE[difficulty]
+    tasks = [
+        equal(rng.standard_normal((m, n)), amplitude * rng.standard_normal(m)) for m in (3, 3, n)
+    ]
+    return [box(n, 0.25), *tasks]
+
+
+def near_singular(rng, angle, limits=True):
+    """n = 11: level 2 spans the rows of level 1 turned by `angle` [rad] in three planes.
+
+    A box of ±0.25 comes first (without it x grows like 1/angle), a posture of 11 rows last.
+    """
+    n, m = 11, 3
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0].T
+    mix = np.linalg.qr(rng.standard_normal((m, m)))[0]
+    turned = np.cos(angle) * Q[:m] + np.sin(angle) * Q[m : 2 * m]
+    levels = [
+        equal(rng.standard_normal((m, m)) @ Q[:m], 0.1 * rng.standard_normal(m)),
+        equal(mix @ turned, 0.1 * rng.standard_normal(m)),
+        equal(np.eye(n), 0.1 * rng.standard_normal(n)),
+    ]
+    return [box(n, 0.25), *levels] if limits else levels
+
+
+def scaling(rng, n, levels):
+    """A box, levels − 2 Gaussian tasks of equal size that leave some freedom, and a posture."""
+    tasks = max(levels - 2, 0)
+    m = max(1, 3 * n // (4 * tasks)) if tasks else 0
+    # Amplitude shrinks with the rows a task stack asks for, so that the box is felt, not dominant.
+    middle = [equal(rng.standard_normal((m, n)), 0.2 * rng.standard_normal(m)) for _ in range(tasks)]
+    return [box(n, 0.25), *middle, equal(np.eye(n), 0.2 * rng.standard_normal(n))]
+
+
+def general(rng, *, max_n=40, max_levels=8, max_rows=12, scales=True):
+    """Anything that a hierarchy may contain, most of it awkward.
+
+    Rows: Gaussian, sparse, single unknowns, zero; repeated, negated, or combined from earlier rows
+    of the same or another level; equalities, one-sided, two-sided, unbounded; bounds that share a
+    feasible point, are tight in it, or contradict one another; integer data with degenerate
+    vertices; scales of the targets, of levels and of rows between 1e-6 and 1e6 (`scales`).
+
+    All numbers are short binary fractions and all scales powers of two, so that rows meant to be
+    dependent, and vertices meant to be degenerate, are so exactly: the optimum is well defined.
+    """
+    n = int(rng.integers(1, 1 + min(max_n, int(rng.choice([3, 6, 11, 20, 40])))))
+    ternary = rng.random() < 0.2
+    feasible = rng.random()  # the share of bounds that admit the common point
+    tight = rng.random() * 0.5  # the share of those that touch it
+    still = rng.random() < 0.1  # all targets zero
+    common = _fraction(rng.standard_normal(n), 6) if rng.random() < 0.7 else np.zeros(n)
+    if ternary:
+        common = np.round(common)
+    graded = scales and rng.random() < 0.15  # every row its own scale
+    spread = scales and rng.random() < 0.3  # every level its own scale
+    target = 2.0 ** rng.integers(-20, 21) if scales and rng.random() < 0.3 else 1.0
+
+    seen, levels = [], []
+    for _ in range(rng.integers(1, max_levels + 1)):
+        m = int(rng.integers(1, max_rows + 1))
+        empty = rng.random() < 0.04  # a level of zero rows
+        size = 2.0 ** rng.integers(-20, 21) if spread else 1.0
+        A, lower, upper = np.empty((m, n)), np.empty(m), np.empty(m)
+        for i in range(m):
+            row = np.zeros(n) if empty else _general_row(rng, n, seen, ternary)
+            if row.any():
+                seen.append(row)
+            low, high = _general_bounds(rng, row @ common, feasible, tight, ternary, still)
+            scale = size * (2.0 ** rng.integers(-20, 21) if graded else 1.0)
+            A[i], lower[i], upper[i] = row * scale, low * scale * target, high * scale * target
+        levels.append(Rows(A, lower, upper))
+    return levels
+
+
+def _fraction(values, bits):
+    """Round to multiples of 2^−bits."""
+    return np.round(np.asarray(values) * 2.0**bits) / 2.0**bits
+
+
+def _general_row(rng, n, seen, ternary):
+    kind = rng.random()
+    if kind < 0.04:
+        return np.zeros(n)
+    if seen and kind < 0.2:  # again, or reversed
+        return seen[rng.integers(len(seen))] * rng.choice([1.0, 1.0, -1.0, 2.0])
+    if seen and kind < 0.32:  # in the span of up to three
+        chosen = [seen[i] for i in rng.integers(len(seen), size=3)]
+        row = np.array(rng.choice([-1.0, 0.0, 0.5, 1.0], size=3) @ chosen)
+        return _fraction(row, 16) if np.array_equal(row, _fraction(row, 16)) else chosen[0]
+    if kind < 0.45:  # one unknown
+        return np.eye(n)[rng.integers(n)]
+    if ternary:
+        return rng.integers(-1, 2, size=n).astype(float)
+    row = _fraction(rng.standard_normal(n), 12)
+    return row * (rng.random(n) < 0.4) if kind < 0.55 else row
+
+
+def _general_bounds(rng, value, feasible, tight, ternary, still):
+    """lower ≤ upper of one row, whose value at the common point is given."""
+    noise = np.abs(rng.integers(1, 4, size=2) if ternary else _fraction(rng.exponential(size=2), 12))
+    if still:
+        value, noise = 0.0, noise * 0.0
+    elif rng.random() > feasible:
+        value = value + (rng.integers(-2, 3) if ternary else _fraction(rng.standard_normal(), 12))
+    if rng.random() < tight:
+        noise[rng.integers(2)] = 0.0
+    form = rng.random()
+    if form < 0.35:
+        return value, value
+    if form < 0.55:
+        return value - noise[0], np.inf
+    if form < 0.75:
+        return -np.inf, value + noise[1]
+    if form < 0.95:
+        return value - noise[0], value + noise[1]
+    return -np.inf, np.inf
