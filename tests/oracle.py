@@ -26,12 +26,13 @@ Tolerance
 """
 
 from decimal import Decimal, localcontext
+from operator import mul
 
 import numpy as np
 
 DIGITS = 180
 RHO = Decimal(10) ** -27
-FLOOR = Decimal(10) ** -10  # of the largest bound: a row whose terms are all zero is compared to it
+FLOOR = Decimal(10) ** -10  # of the farthest bound broken by x = 0: where all terms of a row vanish
 SLACK = RHO * Decimal(10) ** -30  # a constraint is violated by more than this over ϱ, or not at all
 
 
@@ -65,6 +66,7 @@ def _cascade(levels, tol):
         if free.shape[1] == 0:
             break
         x, free, inside = _descend(rows, x, free, inside, tol)
+    x = np.where(abs(x) > tol * FLOOR * reach, x, Decimal(0))
     misses = [_missed(rows, x, tol).astype(float) for rows in exact]
     return x.astype(float), misses
 
@@ -81,9 +83,10 @@ class _Rows:
 
 
 def _reach(rows):
-    """The largest distance from the origin to a bound."""
-    bounds = zip(rows.lower + rows.upper, rows.norm * 2, strict=True)
-    return max((abs(b) / s for b, s in bounds if b is not None and s), default=Decimal(0))
+    """The largest distance from the origin to a bound that the origin breaks."""
+    below = [b for b in zip(rows.lower, rows.norm, strict=True) if b[0] is not None and b[0] > 0]
+    above = [b for b in zip(rows.upper, rows.norm, strict=True) if b[0] is not None and b[0] < 0]
+    return max((abs(b) / norm for b, norm in below + above if norm), default=Decimal(0))
 
 
 def _decimal(values):
@@ -254,42 +257,59 @@ def _nonnegative_least_squares(K):
     """u ≥ 0 that minimises ‖Kᵀ u − e_last‖, by Lawson and Hanson's algorithm."""
     count = len(K)
     norms = [_norm(row) for row in K]
-    gram = {}
     u = _decimal(np.zeros(count))
-    passive = []
+    gram, passive = {}, _Passive()
     for _ in range(20 * count + 20):
         gradient = K[:, -1].copy()
-        for j in passive:
-            gradient = gradient - gram[j] * u[j]
+        for j in passive.members:
+            gradient -= gram[j] * u[j]
         best = max(range(count), key=lambda j: -1 if j in gram else gradient[j] / norms[j])
         if best in gram or gradient[best] <= SLACK * norms[best]:
             return u
-        passive.append(best)
         gram[best] = K @ K[best]
-        while True:
-            s = _solve([[gram[j][i] for j in passive] for i in passive], K[passive, -1])
-            if min(s) > 0:
-                break
-            steps = [u[j] / (u[j] - sj) if sj <= 0 else 2 for j, sj in zip(passive, s, strict=True)]
-            t = min(steps)
-            for j, sj in zip(passive, s, strict=True):
-                u[j] += t * (sj - u[j])
-            for j in [j for j, step in zip(passive, steps, strict=True) if step == t]:
+        passive.add(best, gram[best], K[best, -1])
+        while min(s := passive.solve()) <= 0:
+            steps = [
+                u[j] / (u[j] - sj) if sj <= 0 else Decimal(2)
+                for j, sj in zip(passive.members, s, strict=True)
+            ]
+            for j, sj in zip(passive.members, s, strict=True):
+                u[j] += min(steps) * (sj - u[j])
+            gone = [j for j, t in zip(passive.members, steps, strict=True) if t == min(steps)]
+            kept = [j for j in passive.members if j not in gone]
+            passive = _Passive()
+            for j in kept:
+                passive.add(j, gram[j], K[j, -1])
+            for j in gone:
                 u[j] = Decimal(0)
                 del gram[j]
-            passive = [j for j in passive if j in gram]
-        for j, sj in zip(passive, s, strict=True):
-            u[j] = sj
+        u[passive.members] = s
     raise OracleError("non-negative least squares did not end")
 
 
-def _solve(G, b):
-    """Solve a symmetric positive definite system by elimination."""
-    M = np.column_stack([np.array(G, dtype=object), b])
-    size = len(M)
-    for i in range(size - 1):
-        M[i + 1 :, i + 1 :] -= np.outer(M[i + 1 :, i] / M[i, i], M[i, i + 1 :])
-    s = M[:, -1].copy()
-    for i in range(size - 1, -1, -1):
-        s[i] = (s[i] - M[i, i + 1 : size] @ s[i + 1 :]) / M[i, i] if i + 1 < size else s[i] / M[i, i]
-    return s
+class _Passive:
+    """The positive unknowns, with a growing factor L D Lᵀ of their Gram matrix."""
+
+    def __init__(self):
+        self.members, self.rows, self.pivots, self.half = [], [], [], []
+
+    def add(self, j, gram, target):
+        """Take in unknown j, given column j of the Gram matrix and its right-hand side."""
+        scaled = []  # D l, from L (D l) = g
+        for row, i in zip(self.rows, self.members, strict=True):
+            scaled.append(gram[i] - sum(map(mul, row, scaled), Decimal(0)))
+        row = [v / d for v, d in zip(scaled, self.pivots, strict=True)]
+        pivot = gram[j] - sum(map(mul, row, scaled), Decimal(0))
+        if pivot <= 0:
+            raise OracleError("too few digits for these rows")
+        self.half.append(target - sum(map(mul, row, self.half), Decimal(0)))
+        self.rows.append(row)
+        self.pivots.append(pivot)
+        self.members.append(j)
+
+    def solve(self):
+        """The unconstrained minimum over the members."""
+        s = np.array([h / d for h, d in zip(self.half, self.pivots, strict=True)], dtype=object)
+        for i in range(len(s) - 1, 0, -1):
+            s[:i] -= np.array(self.rows[i], dtype=object) * s[i]
+        return s
