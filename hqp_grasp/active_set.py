@@ -18,6 +18,7 @@ from numba import njit
 EPS = float(np.finfo(np.float64).eps)
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
+ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
 SIGNED = 1e-10  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
 
@@ -277,6 +278,12 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                 wa[i] = -s
             triangular[k] = m == 0
         first[k + 1] = c
+        for i in range(lo, hi):  # a residual of the size of rounding is none
+            size = abs(target[rows[i]])
+            for j in range(c):
+                size += abs(W[i, j] * xq[j])
+            if abs(wa[i]) <= ROUNDING * size:
+                wa[i] = 0.0
     x = xq.copy()
     for k in range(p - 1, -1, -1):  # x = Q xq, the factors of Q from the last to the first
         a, r = first[k], made[k]

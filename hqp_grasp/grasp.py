@@ -12,7 +12,7 @@ UNIT_NORMAL_TOLERANCE = 1e-6  # | ‖n‖ − 1 | accepted in a sensed normal
 
 
 def as_array(name: str, value: object, shape: tuple[int | None, ...]) -> np.ndarray:
-    """Return `value` as a finite float array of `shape` (None: any length), else raise InputError."""
+    """Return `value` as a finite float array of `shape` (None: any length) or raise InputError."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
@@ -82,6 +82,7 @@ class Grasp:
     hessian: np.ndarray | None = None  # (3k, n, n) [m/rad²], world
     coupling: np.ndarray | None = None  # C (N, n): q_full = C q + c₀; identity when None
     offset: np.ndarray | None = None  # c₀ (N,); zero when None
+    other_links: tuple[str, ...] = ()  # geoms beside the contact points that touch the object
     _J3: np.ndarray = field(init=False, repr=False)  # (k, 3, n) view of jacobian
 
     def __post_init__(self) -> None:
@@ -134,7 +135,7 @@ class Grasp:
     @property
     def q_full(self) -> np.ndarray:
         """All joints of the model, C q + c₀ (N,) [rad]."""
-        return self.coupling @ self.q + self.offset  # type: ignore[operator]
+        return self.coupling @ self.q + self.offset
 
     def contact_jacobian(self, i: int) -> np.ndarray:
         """∂x_i/∂q (3, n) [m/rad] of contact i."""

@@ -30,7 +30,7 @@ STRONG = 1e-6  # [–] scaled slack or dual above which a backend's row counts a
 RIDGE = 1e-9  # [–] added to a backend's Hessian; its answer only names the active set
 
 
-class _BackendFailure(Exception):
+class _BackendError(Exception):
     """A QP solver did not solve one level; the message says how it reported that."""
 
 
@@ -84,7 +84,7 @@ class HQP:
                 return found
         try:
             act = _cascade(rows, OWN_INTERFACE.get(self.solver) or _through_qpsolvers(self.solver))
-        except _BackendFailure as failure:
+        except _BackendError as failure:
             failed.append(f"{self.solver}: {failure}")
         else:
             found = self._settle(levels, rows, act, self.solver, failed, POLISH_ROUNDS, 0)
@@ -108,7 +108,7 @@ class HQP:
         pivots: int,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
-        x, w, multipliers, rank, _, _ = active_set.search(
+        x, _, multipliers, rank, _, _ = active_set.search(
             rows.A,
             rows.lower,
             rows.upper,
@@ -180,10 +180,14 @@ def _cascade(rows: Stacked, backend: Backend) -> np.ndarray:
             G[len(standing) :, d:] = -np.eye(slacks)
             base = A[both] @ x
             y, z = backend(
-                P, q, G, (rows.lower[both] - base) / unit[both], (rows.upper[both] - base) / unit[both]
+                P,
+                q,
+                G,
+                (rows.lower[both] - base) / unit[both],
+                (rows.upper[both] - base) / unit[both],
             )
             if not (np.isfinite(y).all() and np.isfinite(z).all()):
-                raise _BackendFailure(f"level {k}: answer is not finite")
+                raise _BackendError(f"level {k}: answer is not finite")
             x = x + Z @ y[:d]
             duals = z[: len(standing)]
         value = A[soft] @ x
@@ -215,7 +219,7 @@ def _proxqp(
     qp.solve()
     status = qp.results.info.status
     if status != proxsuite.proxqp.PROXQP_SOLVED:
-        raise _BackendFailure(f"status {status.name}")
+        raise _BackendError(f"status {status.name}")
     return np.array(qp.results.x), np.array(qp.results.z)
 
 
@@ -227,7 +231,7 @@ def _daqp(
         P, q, G, np.minimum(upper, 1e30), np.maximum(lower, -1e30), sense, primal_tol=BACKEND_EPS
     )
     if flag < 1:
-        raise _BackendFailure(f"exit flag {flag}")
+        raise _BackendError(f"exit flag {flag}")
     return np.array(x), np.array(info["lam"])
 
 
@@ -242,9 +246,9 @@ def _through_qpsolvers(name: str) -> Backend:
         try:
             answer = qpsolvers.solve_problem(problem, name)
         except (qpsolvers.exceptions.QPError, ValueError, ArithmeticError) as error:
-            raise _BackendFailure(f"{type(error).__name__}: {error}") from error
+            raise _BackendError(f"{type(error).__name__}: {error}") from error
         if not answer.found or answer.x is None:
-            raise _BackendFailure("no solution found")
+            raise _BackendError("no solution found")
         z = np.zeros(len(G))
         if len(sides) and answer.z is not None:
             z[has_upper] += answer.z[: has_upper.sum()]

@@ -199,7 +199,7 @@ def optimality_faults(
         pull = x if k == p else A[level == k].T @ w[level == k]
         over = level < k
         rest = _least_imbalance(
-            pull, A[over] , may_push_up[over], may_push_down[over], rows.row_norm[over]
+            pull, A[over], may_push_up[over], may_push_down[over], rows.row_norm[over]
         )
         if rest > scale[k]:
             name = "least norm of x" if k == p else f"level {k}"

@@ -9,7 +9,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, one_of
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.scene import OBJECT, Scene
 
@@ -51,17 +51,23 @@ class GeometricProbe:
 
     The hand moves to q_target with its flexions opened by RETREAT; then each finger closes along
     its flexion to the first touch, to TOUCH or better. Closing overwrites the flexions.
+
+    As in the paper's simulation the object is felt with the fingertips only: other links pass
+    through it, and the grasp names them in `other_links`. With `links="block"` such a touch is a
+    Missed instead.
     """
 
     scene: Scene
+    links: str = "pass"  # or "block"
     _data: mujoco.MjData = field(init=False, repr=False)
     _tips: np.ndarray = field(init=False, repr=False)  # geom ids (k,)
     _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch
     _object: int = field(init=False, repr=False)
-    _speed: np.ndarray = field(init=False, repr=False)  # (k,) [m/rad] bound on a closing tip's speed
+    _speed: np.ndarray = field(init=False, repr=False)  # (k,) [m/rad] no tip closes faster
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        one_of("links", self.links, ("pass", "block"))
         robot, model = self.scene.articulated, self.scene.model
         for point, joints in zip(robot.description.contact_points, robot.flexion, strict=True):
             if len(joints) != 1:
@@ -129,18 +135,20 @@ class GeometricProbe:
                 gaps[i] = self._gap(i)
         else:
             return self._missed(Miss.NO_TOUCH, moving[0])
-        for link in self._links:
-            if self._distance(int(link), 0.0) < -OVERLAP:
-                return Missed(Miss.OTHER_LINK, self.scene.model.geom(int(link)).name)
-        return self._grasp(q)
+        others = tuple(
+            self.scene.model.geom(int(link)).name
+            for link in self._links
+            if self._distance(int(link), 0.0) < -OVERLAP
+        )
+        if others and self.links == "block":
+            return Missed(Miss.OTHER_LINK, others[0])
+        return self._grasp(q, others)
 
     def _missed(self, reason: Miss, i: int) -> Missed:
         return Missed(reason, self.scene.articulated.description.contact_points[i].name)
 
     def _distance(self, geom: int, limit: float, ends: np.ndarray | None = None) -> float:
-        return mujoco.mj_geomDistance(
-            self.scene.model, self._data, geom, self._object, limit, ends
-        )
+        return mujoco.mj_geomDistance(self.scene.model, self._data, geom, self._object, limit, ends)
 
     def _gap(self, i: int) -> float:
         return self._distance(int(self._tips[i]), REACH)
@@ -155,7 +163,7 @@ class GeometricProbe:
         away = self._data.geom_xpos[self._tips[i]] - ends[3:]
         return away / np.linalg.norm(away)
 
-    def _grasp(self, q: np.ndarray) -> Grasp:
+    def _grasp(self, q: np.ndarray, others: tuple[str, ...]) -> Grasp:
         robot, data, model = self.scene.articulated, self._data, self.scene.model
         contacts = []
         for i, point in enumerate(robot.description.contact_points):
@@ -179,4 +187,5 @@ class GeometricProbe:
             hessian=robot.hessian(data),
             coupling=robot.coupling,
             offset=robot.offset,
+            other_links=others,
         )

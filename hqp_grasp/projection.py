@@ -75,9 +75,7 @@ class Projection:
             method="projection" if self.damping == 0.0 else "SR-inverse",
         )
 
-    def _svd(
-        self, M: np.ndarray, A: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    def _svd(self, M: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         if 0 in M.shape:
             return np.eye(len(M)), np.zeros(0), np.eye(M.shape[1]), 0
         U, sigma, Vt = np.linalg.svd(M)

@@ -48,7 +48,9 @@ class RobotDescription:
                 raise ModelError(f"{folder} is no robot folder: it has no robot.toml")
         else:
             root = Path(str(resources.files("hqp_grasp.robots")))
-            folder = root / one_of("robot", robot, sorted(p.parent.name for p in root.glob("*/*.toml")))
+            folder = root / one_of(
+                "robot", robot, sorted(p.parent.name for p in root.glob("*/*.toml"))
+            )
         text = (folder / "robot.toml").read_text()
         try:
             data = tomllib.loads(text)
@@ -176,7 +178,10 @@ class Robot:
 
     def jacobian(self, data: mujoco.MjData) -> np.ndarray:
         """∂x/∂q (3k, n) [m/rad] of the contact points' centres where the robot stands."""
-        return self._point_jacobian(data).transpose(0, 2, 1).reshape(-1, self.model.njnt) @ self.coupling
+        return (
+            self._point_jacobian(data).transpose(0, 2, 1).reshape(-1, self.model.njnt)
+            @ self.coupling
+        )
 
     def hessian(self, data: mujoco.MjData) -> np.ndarray:
         """∂²x/∂q² (3k, n, n) [m/rad²] of the contact points' centres where the robot stands.

@@ -26,7 +26,7 @@ class Cylinder:
     """An upright cylinder."""
 
     radius: float  # [m]
-    height: float = 0.3  # [m]
+    height: float = 0.4  # [m]
 
     def __post_init__(self) -> None:
         _positive("Cylinder.radius", self.radius)
@@ -47,7 +47,7 @@ class Prism:
     """An upright prism over a convex polygon, its corners counter-clockwise around the origin."""
 
     polygon: tuple[tuple[float, float], ...]  # (m, 2) [m]
-    height: float = 0.3  # [m]
+    height: float = 0.4  # [m]
 
     def __post_init__(self) -> None:
         _positive("Prism.height", self.height)
@@ -67,7 +67,7 @@ class Prism:
         object.__setattr__(self, "polygon", tuple((float(x), float(y)) for x, y in corners))
 
     @classmethod
-    def regular(cls, sides: int, side: float, height: float = 0.3) -> Prism:
+    def regular(cls, sides: int, side: float, height: float = 0.4) -> Prism:
         """A regular polygon with sides of `side` [m], one corner on the x axis."""
         _positive("Prism side", side)
         angles = 2.0 * np.pi * np.arange(sides) / sides
@@ -90,7 +90,7 @@ class Scene:
     """A robot and an object that stands still, its middle at `position`."""
 
     robot: str | Path = "wam_bhand"
-    object: Cylinder | Prism = Cylinder(radius=0.05)  # noqa: RUF009 - a frozen value
+    object: Cylinder | Prism = Cylinder(radius=0.05)
     position: tuple[float, float, float] = (0.72, 0.0, 0.2)  # [m] world
 
     def __post_init__(self) -> None:

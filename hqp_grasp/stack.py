@@ -63,7 +63,9 @@ class Stack:
         """`a + b`: b at the priority of the last laws of a."""
         if isinstance(other, Stack):
             if len(other.priorities) != 1:
-                raise InputError("`+` puts laws at one priority: add a task, or stacks of one level")
+                raise InputError(
+                    "`+` puts laws at one priority: add a task, or stacks of one level"
+                )
             beside, limits = other.priorities[0], other.limits
         else:
             beside, limits = (_task(other),), ()

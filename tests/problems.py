@@ -24,8 +24,8 @@ def box(n, bound):
     return Rows(np.eye(n), np.full(n, -bound), np.full(n, bound))
 
 
-# Standard deviation of the targets. The share of 1000 problems whose first task cannot be met within
-# the box is 0.0 % (easy), 15.2 % (mid), 52.7 % (hard), by running, in this folder,
+# Standard deviation of the targets. The share of 1000 problems whose first task cannot be met
+# within the box is 0.0 % (easy), 15.2 % (mid), 52.7 % (hard), by running, in this folder,
 #   python -c "
 #   from numpy.random import default_rng as r; from oracle import *; from problems import *
 #   for d in AMPLITUDE: print(d, sum(
@@ -134,7 +134,9 @@ def _general_row(rng, n, seen, ternary):
 
 def _general_bounds(rng, value, feasible, tight, ternary, still):
     """lower ≤ upper of one row, whose value at the common point is given."""
-    noise = np.abs(rng.integers(1, 4, size=2) if ternary else _fraction(rng.exponential(size=2), 12))
+    noise = np.abs(
+        rng.integers(1, 4, size=2) if ternary else _fraction(rng.exponential(size=2), 12)
+    )
     if still:
         value, noise = 0.0, noise * 0.0
     elif rng.random() > feasible:

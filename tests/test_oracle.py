@@ -142,12 +142,13 @@ def test_equalities_follow_the_pseudoinverse_recursion(seed):
     rng = np.random.default_rng(seed)
     n = 11
     levels = [equal(rng.standard_normal((m, n)), rng.standard_normal(m)) for m in (3, 2, 4, 6)]
-    levels.insert(2, equal(levels[0].A[:2] @ [[1.0, 0.0]] * 0 + levels[0].A[:2], [1.0, -1.0]))
+    levels.insert(2, equal(levels[0].A[:2], [1.0, -1.0]))  # which cannot be met any more
     x, N = np.zeros(n), np.eye(n)
     for A, b, _ in levels:
-        inverse = np.linalg.pinv(A @ N, rcond=1e-10)
+        free = A @ N
+        inverse = np.linalg.pinv(np.where(np.abs(free) > 1e-10, free, 0), rcond=1e-10)
         x = x + inverse @ (b - A @ x)
-        N = N - inverse @ (A @ N)
+        N = N - inverse @ free
     found, _ = lexicographic_optimum(levels)
     np.testing.assert_allclose(found, x, rtol=0, atol=1e-11)
 
@@ -186,6 +187,20 @@ def test_rows_parallel_up_to_rounding_are_parallel():
     np.testing.assert_allclose(y, x, rtol=0, atol=1e-14)
     assert not lexicographic_optimum([equal([row], [1]), equal([row / 3], [1 / 3])])[1][1].any()
     assert w[2][0] != 0
+
+
+@pytest.mark.parametrize("towards", [-1.0, 1.0])
+def test_bounds_that_meet_up_to_rounding_leave_the_plane_between_them_free(towards):
+    rng = np.random.default_rng(0)
+    row = rng.standard_normal(4)
+    across = nullspace([row], 4).T
+    levels = [
+        rows((row, -INF, 1)),
+        rows((row / 3, 1 / 3, INF)),
+        equal(across, 100 * towards * rng.standard_normal(3)),
+    ]
+    _, w = lexicographic_optimum(levels)
+    assert not any(part.any() for part in w)
 
 
 def test_rows_weighted_a_million_to_one_still_divide_exactly():
@@ -315,12 +330,12 @@ def attempt(rng, level, still, sided, inside, x, w):
 def test_no_admissible_step_improves_any_level():
     rng = np.random.default_rng(0)
     found = 0
-    makers = [made(*p) for p in PROBLEMS[5:15]] + [small(seed) for seed in range(40, 60)]
-    for levels in makers:
+    problems = [made(*p) for p in PROBLEMS[5:15]] + [small(seed) for seed in range(40, 60)]
+    for levels in problems:
         x, misses = lexicographic_optimum(levels)
         still, sided, inside = [], [], []
         for level, w in zip([*levels, posture(len(x))], [*misses, x], strict=True):
-            for _ in range(10):
+            for _ in range(15):
                 found += attempt(rng, level, still, sided, inside, x, w)
             more = kept(level, w, x)
             still, sided = still + more[0], sided + more[1]
