@@ -134,10 +134,12 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
     p = len(off) - 1
     rows = np.empty(M, np.int64)
     start = np.empty(p + 1, np.int64)
+    demanding = np.zeros(p, np.bool_)  # levels with equalities
     ma = 0
     for k in range(p):
         start[k] = ma
         for i in range(off[k], off[k + 1]):
+            demanding[k] |= act[i] == 2
             if act[i] != 0:
                 rows[ma] = i
                 ma += 1
@@ -164,7 +166,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
         steps = min(m, n - c)
         if steps > 0 and frobenius[k] > 0.0:
             size = max(off[k + 1] - off[k], n)
-            if rank_tolerance < 0.0:
+            if rank_tolerance < 0.0 or not demanding[k]:  # a limit is never truncated
                 rough = size * EPS * frobenius[k]
             else:
                 rough = rank_tolerance * frobenius[k]

@@ -121,8 +121,9 @@ class HQP:
             pivots,
         )
         n = rows.A.shape[1]
-        tol = CERTIFICATE_TOLERANCE
-        faults = optimality_faults(rows, x, multipliers, tol, least_norm=bool(rank.sum() < n))
+        tol, left = CERTIFICATE_TOLERANCE, self.rank_tolerance or 0.0
+        shortest = bool(rank.sum() < n)
+        faults = optimality_faults(rows, x, multipliers, tol, left, least_norm=shortest)
         if faults:
             failed.append(f"{method}: {faults[0]}")
             return None
@@ -135,7 +136,7 @@ class HQP:
             own = slice(rows.offsets[k], rows.offsets[k + 1])
             status = "nearest" if unmet[own].any() else "met"
             reports.append(LevelReport(level.name, residual[own], int(rank[k]), status))
-        return Solution(x, tuple(reports), act, multipliers[:, :-1], method, tuple(failed))
+        return Solution(x, tuple(reports), act, multipliers[:, :-1], method, tuple(failed), left)
 
 
 def _possible(act: np.ndarray, rows: Stacked) -> np.ndarray:

@@ -109,6 +109,7 @@ class Solution:
     multipliers: np.ndarray  # (M, p): column k holds those of the rows above level k
     method: str  # the way that found x
     failed: tuple[str, ...] = ()  # ways tried before whose answers failed the certificate
+    rank_tolerance: float = 0.0  # [–] the user's, 0 for the default rule
 
     @property
     def limit_active(self) -> bool:
@@ -122,8 +123,11 @@ class Solution:
         that hold x: of either sign for equalities and rows that cannot be met, pushing inwards
         for rows at a bound. Where the multipliers at hand do not show it, others are searched by
         non-negative least squares (degenerate active sets have many); no QP solver takes part.
+        With a rank tolerance of the user's, a level may leave what lies in directions weaker than
+        that.
         """
-        return not optimality_faults(stack(levels), self.x, self.multipliers, tol)
+        rows = stack(levels)
+        return not optimality_faults(rows, self.x, self.multipliers, tol, self.rank_tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +162,12 @@ def stack(levels: Sequence[Level]) -> Stacked:
 
 
 def optimality_faults(
-    rows: Stacked, x: np.ndarray, multipliers: np.ndarray, tol: float, least_norm: bool = False
+    rows: Stacked,
+    x: np.ndarray,
+    multipliers: np.ndarray,
+    tol: float,
+    rank_tolerance: float = 0.0,
+    least_norm: bool = False,
 ) -> list[str]:
     """What keeps x from being certified as the optimum of the hierarchy; empty where nothing does.
 
@@ -188,7 +197,8 @@ def optimality_faults(
         gradient[:, p] += x
     units = np.sqrt(np.add.reduceat(np.append(unit**2, 0.0), rows.offsets[:-1]))
     units[np.diff(rows.offsets) == 0] = 0.0
-    scale = tol * np.append(rows.frobenius * units, length)[:columns]
+    left = rank_tolerance * np.sqrt(np.add.reduceat(np.append(w**2, 0.0), rows.offsets[:-1]))
+    scale = np.append(rows.frobenius * (tol * units + left), tol * length)[:columns]
     push = forces * rows.row_norm[:, None]
     wrong = above & (
         ((push > scale) & ~may_push_up[:, None]) | ((push < -scale) & ~may_push_down[:, None])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import mink
 import mujoco
@@ -41,8 +42,8 @@ class StepLimit(Limit):
     Rows are shares of the cap [–], so that radians and metres stand side by side.
     """
 
-    joint: float = 0.25  # [rad]
-    contact: float = 0.02  # [m]
+    joint: float = 0.5  # [rad]
+    contact: float = 0.04  # [m]
     rank = Rank.CAP
 
     def __post_init__(self) -> None:
@@ -127,10 +128,10 @@ class MinkLimit(Limit):
 
     def level(self, grasp: Grasp) -> Level:
         # mink's VelocityLimit reads no configuration, and keeps no model to make one from.
-        configuration = self.model and mink.Configuration(self.model, q=grasp.q_full)
+        configuration: Any = self.model and mink.Configuration(self.model, q=grasp.q_full)
         G, h = self.limit.compute_qp_inequalities(configuration, self.dt)
         name = type(self.limit).__name__
-        if G is None:
+        if G is None or h is None:
             return Level(np.zeros((0, grasp.n)), np.zeros(0), np.zeros(0), name)
         A = G @ grasp.coupling
         kept = np.isfinite(h)

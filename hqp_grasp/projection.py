@@ -1,4 +1,4 @@
-"""The paper's way to compose control laws: nullspace recursion and the SR-inverse, in numpy only."""
+"""The paper's way to compose laws: nullspace recursion and SR-inverse, in numpy only."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -81,7 +81,7 @@ class RobotDescription:
             raise ModelError(f"{self.xml} is not a valid MJCF: {error}") from error
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """A described robot inside a compiled MuJoCo model.
 
@@ -155,6 +155,9 @@ class Robot:
         put("_ancestor", np.array([np.isin(np.arange(model.njnt), c) for c in chains]))
         # Joints are numbered from the base outwards, so the smaller number is nearer the base.
         put("_nearer_base", np.triu(np.ones((model.njnt, model.njnt), dtype=bool)))
+
+    def __repr__(self) -> str:
+        return f"Robot({self.description.name!r})"
 
     @property
     def n(self) -> int:
@@ -269,6 +272,7 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
         if not model.eq_active0[e]:
             continue
         kind, coefficients = model.eq_type[e], model.eq_data[e]
+        side: Callable[[mujoco.MjModel, int], tuple[np.ndarray, float]]
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
             side = _joint_row
         elif kind == int(mujoco.mjtEq.mjEQ_TENDON):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -118,10 +119,10 @@ class Scene:
         """The robot as it stands in this scene's model."""
         return Robot(self.__dict__["_description"], self.model)
 
-    def __getstate__(self) -> dict[str, object]:
+    def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.
         return {"robot": self.robot, "object": self.object, "position": self.position}
 
-    def __setstate__(self, state: dict[str, object]) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.__post_init__()

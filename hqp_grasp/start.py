@@ -19,6 +19,7 @@ ADDUCTION = (np.radians(10.0), np.radians(90.0))  # [rad] (paper, section 4)
 ELEVATION = (np.radians(30.0), np.radians(50.0))  # [rad] of the approach axis below horizontal
 OFFSET = (-0.18, 0.18)  # [m] of the palm from the object's axis, in x and in y
 ADVANCE = 0.01  # [m] the palm comes nearer by, while the fingers do not reach
+UPRIGHT = 0.05  # [–] vertical part of the normal of an upright side, at most
 MAX_DRAWS = 500  # draws before the object counts as out of reach
 MAX_IK_STEPS = 60
 IK_STEP = 0.3  # [rad]
@@ -39,7 +40,9 @@ def first_touch(scene: Scene, probe: Probe, rng: np.random.Generator) -> Start:
     Adduction, elevation and horizontal offset of the palm are uniform over the paper's ranges.
     What the paper leaves open: the approach axis meets the object's axis at its middle, from the
     robot's side (a draw beyond the object is mirrored), the opposition axis is horizontal, and
-    the palm advances along the approach axis, by ADVANCE at a time, until all fingers reach.
+    the palm advances along the approach axis, by ADVANCE at a time, until all fingers reach. A
+    draw is rejected where the arm cannot go, a fingertip meets an edge or the top instead of the
+    upright side, or another link touches too.
     Raises ReachError after MAX_DRAWS draws without a touch.
     """
     robot = scene.articulated
@@ -56,7 +59,10 @@ def first_touch(scene: Scene, probe: Probe, rng: np.random.Generator) -> Start:
                 break
             touched = probe.touch(q)
             if isinstance(touched, Grasp):
-                return Start(touched, rejected)
+                last = _flaw(touched)
+                if not last:
+                    return Start(touched, rejected)
+                break
             last = f"{touched.reason.value} ({touched.where})"
             if touched.reason is not Miss.NO_TOUCH:
                 break
@@ -65,6 +71,16 @@ def first_touch(scene: Scene, probe: Probe, rng: np.random.Generator) -> Start:
         f"{robot.description.name} touches the object at {scene.position} from none of {MAX_DRAWS} "
         f"drawn postures (the last: {last}); move the object, or take another"
     )
+
+
+def _flaw(grasp: Grasp) -> str:
+    """Why a touch is no start, empty where it is one."""
+    if grasp.other_links:
+        return f"{grasp.other_links[0]} touches the object"
+    for contact in grasp.contacts:
+        if abs(contact.normal[2]) > UPRIGHT:
+            return f"{contact.name} meets an edge or the top of the object"
+    return ""
 
 
 def _reach(

@@ -31,7 +31,8 @@ class KinematicTask(Task):
     `potential` is their sum ε_c and `gradient` its slope (paper, eq. 8–9). As in eq. 9 the contact
     is a point of the hand, and its normal is held fixed.
 
-    - form="rows": one Newton row per contact, J_i x = −gain·ε_i, with gain [–].
+    - form="rows": one Newton row per contact, J_i x = −gain·ε_i, with gain [–]. Full steps aim at
+      a zero that most hands cannot reach, and chatter about the minimum; a quarter settles.
     - form="gradient": the paper's dq_c ∝ −∂ε_c/∂q as a level of n rows, x = −gain·∂ε_c/∂q. It
       fixes every joint, so nothing below it is felt. Here gain has the unit rad²/(unit of ε):
       rad for "angle", rad³/m for "eq7".
@@ -47,7 +48,7 @@ class KinematicTask(Task):
         error: str = "angle",
         form: str = "rows",
         *,
-        gain: float = 1.0,
+        gain: float = 0.25,
         weight: float = 1.0,
     ) -> None:
         set_field = object.__setattr__
