@@ -42,8 +42,8 @@ class StepLimit(Limit):
     Rows are shares of the cap [–], so that radians and metres stand side by side.
     """
 
-    joint: float = 0.5  # [rad]
-    contact: float = 0.04  # [m]
+    joint: float = 0.35  # [rad]
+    contact: float = 0.03  # [m]
     rank = Rank.CAP
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ class Cylinder:
     """An upright cylinder."""
 
     radius: float  # [m]
-    height: float = 0.4  # [m]
+    height: float = 0.12  # [m]
 
     def __post_init__(self) -> None:
         _positive("Cylinder.radius", self.radius)
@@ -48,7 +48,7 @@ class Prism:
     """An upright prism over a convex polygon, its corners counter-clockwise around the origin."""
 
     polygon: tuple[tuple[float, float], ...]  # (m, 2) [m]
-    height: float = 0.4  # [m]
+    height: float = 0.12  # [m]
 
     def __post_init__(self) -> None:
         _positive("Prism.height", self.height)
@@ -68,7 +68,7 @@ class Prism:
         object.__setattr__(self, "polygon", tuple((float(x), float(y)) for x, y in corners))
 
     @classmethod
-    def regular(cls, sides: int, side: float, height: float = 0.4) -> Prism:
+    def regular(cls, sides: int, side: float, height: float = 0.12) -> Prism:
         """A regular polygon with sides of `side` [m], one corner on the x axis."""
         _positive("Prism side", side)
         angles = 2.0 * np.pi * np.arange(sides) / sides

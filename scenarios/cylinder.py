@@ -1,14 +1,14 @@
 """The paper's first object: a cylinder of 5 cm radius, grasped by touch.
 
-python scenarios/cylinder.py --help
-python scenarios/cylinder.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2 --out DIR
+    python scenarios/cylinder.py --help
+    python scenarios/cylinder.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg
 from hqp_grasp.scenario import main
 
-# A pillar: taller than the hand ever climbs, so that the fingertips meet its side only.
-scene = hg.Scene(robot="wam_bhand", object=hg.Cylinder(radius=0.05, height=0.4))
+# As tall as a can: the hand ends above it, with the palm and the links clear of its top.
+scene = hg.Scene(robot="wam_bhand", object=hg.Cylinder(radius=0.05, height=0.12))
 
 if __name__ == "__main__":
     # The laws, their order and the limits come from the command line; see --help.
