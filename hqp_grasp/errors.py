@@ -29,6 +29,14 @@ class SingularTaskError(HqpGraspError, ArithmeticError):
     """A control law is undefined at this grasp, for a reason that the message names."""
 
 
+def number(name: str, value: object) -> float:
+    """Return `value` as a float, else raise InputError."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be a number; got {value!r}") from error
+
+
 def one_of(name: str, value: object, choices: object) -> str:
     """Return `value` if it is among `choices`, else raise InputError listing them."""
     valid = [str(c) for c in choices]  # type: ignore[attr-defined]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, number
 
 UNIT_NORMAL_TOLERANCE = 1e-6  # | ‖n‖ − 1 | accepted in a sensed normal
 
@@ -60,7 +61,14 @@ class Contact:
             set_field(self, "point", as_array("Contact.point", self.point, (3,)))
         if self.wrench is not None:
             set_field(self, "wrench", as_array("Contact.wrench", self.wrench, (6,)))
-        set_field(self, "flexion", tuple(int(i) for i in self.flexion))
+        try:
+            set_field(self, "flexion", tuple(operator.index(i) for i in self.flexion))
+        except TypeError as error:
+            raise InputError(
+                f"Contact.flexion must list indices into q; got {self.flexion!r}"
+            ) from error
+        set_field(self, "tip_radius", number("Contact.tip_radius", self.tip_radius))
+        set_field(self, "confidence", number("Contact.confidence", self.confidence))
         if not (np.isfinite(self.tip_radius) and self.tip_radius >= 0.0):
             raise InputError(f"Contact.tip_radius must be ≥ 0 [m]; got {self.tip_radius}")
         if not 0.0 <= self.confidence <= 1.0:
@@ -89,7 +97,12 @@ class Grasp:
         set_field = object.__setattr__
         q = as_array("Grasp.q", self.q, (None,))
         n = len(q)
-        contacts = tuple(self.contacts)
+        try:
+            contacts = tuple(self.contacts)
+        except TypeError as error:
+            raise InputError(
+                f"Grasp.contacts must list Contact values; got {self.contacts!r}"
+            ) from error
         if not contacts:
             raise InputError("Grasp.contacts is empty: a grasp has at least one contact")
         for contact in contacts:

@@ -11,7 +11,7 @@ import mink
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, number
 from hqp_grasp.grasp import Grasp, as_array
 from hqp_grasp.level import Level
 from hqp_grasp.robot import Robot
@@ -48,7 +48,7 @@ class StepLimit(Limit):
 
     def __post_init__(self) -> None:
         for name in ("joint", "contact"):
-            if not getattr(self, name) > 0.0:
+            if not number(f"StepLimit.{name} must be above 0: it", getattr(self, name)) > 0.0:
                 raise InputError(f"StepLimit.{name} must be above 0; got {getattr(self, name)}")
 
     def level(self, grasp: Grasp) -> Level:
@@ -75,6 +75,10 @@ class VelocityLimit(Limit):
             raise InputError("VelocityLimit needs velocities and dt above 0")
 
     def level(self, grasp: Grasp) -> Level:
+        if len(self.velocity) != grasp.n:
+            raise InputError(
+                f"VelocityLimit has {len(self.velocity)} velocities; the grasp has {grasp.n} joints"
+            )
         one = np.ones(grasp.n)
         return Level(np.diag(1.0 / (self.velocity * self.dt)), -one, one, "velocity")
 

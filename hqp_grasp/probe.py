@@ -17,7 +17,7 @@ RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves
 TOUCH = 1e-9  # [m] gap at which a tip touches
 OVERLAP = 1e-7  # [m] a link this deep in the object touches it
 NEAR = 5e-3  # [m] gap below which Newton's method finds the touch
-MAX_CLOSING_STEPS = 200
+MAX_CLOSING_STEPS = 2000  # tens, but for tips that graze
 REACH = 0.5  # [m] gaps beyond this are not measured
 
 
@@ -120,7 +120,7 @@ class GeometricProbe:
             J = None
             for i in moving:
                 j = flexion[i]
-                if q[j] >= robot.q_upper[j]:
+                if q[j] >= robot.q_upper[j] and gaps[i] > 0.0:
                     return self._missed(Miss.NO_TOUCH, i)
                 step = gaps[i] / self._speed[i]  # cannot pass the first touch
                 if gaps[i] < NEAR:

@@ -11,9 +11,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, ModelError, one_of
+from hqp_grasp.errors import InputError, ModelError, number, one_of
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class RobotDescription:
     @classmethod
     def load(cls, robot: str | Path) -> RobotDescription:
         """Read a robot of this package by name, or any folder with a robot.toml by its path."""
-        if isinstance(robot, Path) or "/" in robot:
+        if isinstance(robot, Path) or "/" in str(robot):
             folder = Path(robot)
             if not (folder / "robot.toml").is_file():
                 raise ModelError(f"{folder} is no robot folder: it has no robot.toml")
@@ -55,30 +57,44 @@ class RobotDescription:
         try:
             data = tomllib.loads(text)
             points = tuple(
-                ContactPoint(p["name"], p["site"], p["geom"], tuple(p["flexion"]))
+                ContactPoint(
+                    _text(p["name"]), _text(p["site"]), _text(p["geom"]), _texts(p["flexion"])
+                )
                 for p in data["contact_points"]
             )
             return cls(
                 name=folder.name,
                 xml=folder / data["model"],
-                home=data["home"],
-                palm=data["palm"],
-                arm=tuple(data["arm"]),
-                adduction=data.get("adduction"),
-                velocity=dict(data["velocity"]),
+                home=_text(data["home"]),
+                palm=_text(data["palm"]),
+                arm=_texts(data["arm"]),
+                adduction=_text(data["adduction"]) if "adduction" in data else None,
+                velocity={j: number(f"velocity of {j}", v) for j, v in data["velocity"].items()},
                 contact_points=points,
             )
         except tomllib.TOMLDecodeError as error:
             raise ModelError(f"{folder / 'robot.toml'} is not valid TOML: {error}") from error
         except KeyError as error:
             raise ModelError(f"{folder / 'robot.toml'} lacks the entry {error}") from error
+        except (TypeError, AttributeError, InputError) as error:
+            raise ModelError(
+                f"{folder / 'robot.toml'}: an entry is of the wrong kind: {error}"
+            ) from error
 
     def spec(self) -> mujoco.MjSpec:
         """The authored model, ready to be composed with others."""
         try:
-            return mujoco.MjSpec.from_file(str(self.xml))
+            spec = mujoco.MjSpec.from_file(str(self.xml))
         except ValueError as error:
             raise ModelError(f"{self.xml} is not a valid MJCF: {error}") from error
+        # MuJoCo fills a keyframe that is too short with zeros, without a word.
+        for key in spec.keys:
+            if 0 < len(key.qpos) < len(spec.joints):
+                raise ModelError(
+                    f"keyframe {key.name!r} of {self.xml.name} has {len(key.qpos)} angles; "
+                    f"the model has {len(spec.joints)} joints"
+                )
+        return spec
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,7 +151,12 @@ class Robot:
         missing = [j for j in self.joints if j not in about.velocity]
         if missing:
             raise ModelError(f"robot.toml of {about.name} gives no velocity for {missing}")
-        put("velocity", np.array([about.velocity[j] for j in self.joints], dtype=float))
+        velocity = np.array([about.velocity[j] for j in self.joints], dtype=float)
+        if not ((velocity > 0.0) & np.isfinite(velocity)).all():
+            raise ModelError(
+                f"robot.toml of {about.name}: every velocity must be finite and above 0"
+            )
+        put("velocity", velocity)
         key = _id(model, mujoco.mjtObj.mjOBJ_KEY, about.home, "keyframe", about)
         put("home", model.key_qpos[key][independent].copy())
         _id(model, mujoco.mjtObj.mjOBJ_SITE, about.palm, "site", about)
@@ -145,7 +166,12 @@ class Robot:
         put("flexion", tuple(tuple(self.index(j) for j in p.flexion) for p in points))
         sites = [_id(model, mujoco.mjtObj.mjOBJ_SITE, p.site, "site", about) for p in points]
         geoms = [_id(model, mujoco.mjtObj.mjOBJ_GEOM, p.geom, "geom", about) for p in points]
-        for p, g in zip(points, geoms, strict=True):
+        for p, s, g in zip(points, sites, geoms, strict=True):
+            same = model.site_bodyid[s] == model.geom_bodyid[g]
+            if not same or np.abs(model.site_pos[s] - model.geom_pos[g]).max() > CENTRED:
+                raise ModelError(
+                    f"site {p.site!r} of {about.name} must be at the centre of its geom {p.geom!r}"
+                )
             if model.geom_type[g] != int(mujoco.mjtGeom.mjGEOM_SPHERE):
                 raise ModelError(f"geom {p.geom!r} of {about.name} must be a sphere: a round tip")
         put("_sites", np.array(sites))
@@ -222,12 +248,27 @@ class Robot:
 
     def require_q(self, name: str, q: object) -> np.ndarray:
         """Return q as a finite (n,) array, else raise InputError."""
-        array = np.asarray(q, dtype=float)
+        try:
+            array = np.asarray(q, dtype=float)
+        except (TypeError, ValueError):
+            array = np.zeros(0)
         if array.shape != (self.n,) or not np.isfinite(array).all():
             raise InputError(
                 f"{name} must be {self.n} finite angles, for {', '.join(self.joints)}; got {q!r}"
             )
         return array
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"{value!r} is no name")
+    return value
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise InputError(f"{value!r} is no list of names")
+    return tuple(_text(v) for v in value)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, number
+from hqp_grasp.grasp import as_array
 from hqp_grasp.robot import Robot, RobotDescription
 
 OBJECT = "object"  # name of the object's body and geom in a scene
@@ -18,6 +19,7 @@ OBJECT_COLOUR = (0.85, 0.55, 0.25, 1.0)
 
 
 def _positive(name: str, value: float) -> None:
+    value = number(name, value)
     if not (np.isfinite(value) and value > 0.0):
         raise InputError(f"{name} must be above 0 [m]; got {value}")
 
@@ -52,7 +54,12 @@ class Prism:
 
     def __post_init__(self) -> None:
         _positive("Prism.height", self.height)
-        corners = np.asarray(self.polygon, dtype=float)
+        try:
+            corners = np.asarray(self.polygon, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"Prism.polygon must be corners (x, y); got {self.polygon!r}"
+            ) from error
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
             raise InputError(f"Prism.polygon needs at least 3 corners (x, y); got {self.polygon!r}")
         if not np.isfinite(corners).all():
@@ -61,7 +68,9 @@ class Prism:
         following = np.roll(edges, -1, axis=0)
         turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
         inside = corners[:, 0] * edges[:, 1] - corners[:, 1] * edges[:, 0]
-        if not ((turns > 0.0).all() and (inside > 0.0).all()):
+        bearings = np.arctan2(corners[:, 1], corners[:, 0])
+        once = (np.roll(bearings, -1) < bearings).sum() == 1  # a star goes around twice
+        if not ((turns > 0.0).all() and (inside > 0.0).all() and once):
             raise InputError(
                 "Prism.polygon must be strictly convex, counter-clockwise, around the origin"
             )
@@ -71,6 +80,8 @@ class Prism:
     def regular(cls, sides: int, side: float, height: float = 0.12) -> Prism:
         """A regular polygon with sides of `side` [m], one corner on the x axis."""
         _positive("Prism side", side)
+        if sides < 3:
+            raise InputError(f"Prism.regular needs at least 3 sides; got {sides}")
         angles = 2.0 * np.pi * np.arange(sides) / sides
         radius = side / (2.0 * np.sin(np.pi / sides))
         corners = radius * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -97,8 +108,13 @@ class Scene:
     def __post_init__(self) -> None:
         if not isinstance(self.object, Cylinder | Prism):
             raise InputError(f"unknown object {self.object!r}; choose one of: Cylinder, Prism")
-        if np.shape(self.position) != (3,) or not np.isfinite(self.position).all():
-            raise InputError(f"Scene.position must be 3 finite numbers; got {self.position!r}")
+        try:
+            position = as_array("Scene.position", self.position, (3,))
+        except InputError as error:
+            raise InputError(
+                f"Scene.position must be 3 finite numbers; got {self.position!r}"
+            ) from error
+        object.__setattr__(self, "position", tuple(position.tolist()))
         description = RobotDescription.load(self.robot)
         object.__setattr__(self, "_description", description)
 
@@ -107,9 +123,9 @@ class Scene:
         """Robot and object, compiled."""
         description: RobotDescription = self.__dict__["_description"]
         spec = description.spec()
-        body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
-        self.object.add_geom(spec, body)
         try:
+            body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
+            self.object.add_geom(spec, body)
             return spec.compile()
         except ValueError as error:
             raise InputError(f"{description.xml.name} does not compile: {error}") from error

@@ -29,6 +29,14 @@ class Stack:
     limits: tuple[Limit, ...] = ()
     hold_contacts: bool = True  # ContactTask between the limits and the laws
 
+    def __post_init__(self) -> None:
+        full = self.priorities and all(isinstance(p, tuple) and p for p in self.priorities)
+        if not full or not all(isinstance(t, Task) for p in self.priorities for t in p):
+            raise InputError(
+                "Stack.priorities must be tuples of control laws, none of them empty; "
+                f"got {self.priorities!r}"
+            )
+
     @classmethod
     def of(cls, task: Task) -> Stack:
         """A stack of one law."""
@@ -37,7 +45,13 @@ class Stack:
     @classmethod
     def from_letters(cls, letters: str, kinematic_error: str = "angle") -> Stack:
         """Φ by its letters: "fmk" is force ▷ moment ▷ kinematic."""
-        if not letters or len(set(letters)) < len(letters) or set(letters) - set(LETTERS):
+        known = isinstance(letters, str)
+        if (
+            not known
+            or not letters
+            or len(set(letters)) < len(letters)
+            or set(letters) - set(LETTERS)
+        ):
             raise InputError(
                 f"unknown stack {letters!r}; write each law once, by its letter: "
                 "f (force), m (moment), k (kinematic)"
@@ -66,11 +80,15 @@ class Stack:
                 raise InputError(
                     "`+` puts laws at one priority: add a task, or stacks of one level"
                 )
-            beside, limits = other.priorities[0], other.limits
+            beside = other
         else:
-            beside, limits = (_task(other),), ()
-        last = self.priorities[-1] + beside
-        return replace(self, priorities=(*self.priorities[:-1], last), limits=self.limits + limits)
+            beside = Stack.of(_task(other))
+        return replace(
+            self,
+            priorities=(*self.priorities[:-1], self.priorities[-1] + beside.priorities[0]),
+            limits=self.limits + beside.limits,
+            hold_contacts=self.hold_contacts and beside.hold_contacts,
+        )
 
     def within(self, *limits: Limit | mink.Limit) -> Stack:
         """The same laws below these limits too; mink's are taken as they are."""

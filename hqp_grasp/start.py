@@ -106,7 +106,7 @@ def _reach(
     x *= np.sign(data.site_xmat[site].reshape(3, 3)[:, 0] @ x) or 1.0
     R_palm = np.column_stack([x, np.cross(z, x), z])
     hqp = HQP()
-    free = np.array([j for j in range(robot.n) if j not in fixed])
+    free = np.array([j for j in range(robot.n) if j not in fixed], dtype=int)
     keep = np.eye(robot.n)[fixed]
     for _ in range(MAX_IK_STEPS):
         robot.place(data, q)

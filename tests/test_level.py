@@ -290,6 +290,23 @@ def test_a_point_that_holds_back_at_no_bound_is_rejected():
     assert not claim(levels, [1.0 - 1e-6, 0.0]).is_optimal(levels)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
+def test_a_limit_in_small_units_beside_one_in_large_units_is_kept(unit):
+    limits = Rows(np.diag([1.0, unit]), np.full(2, -INF), np.array([1.0, unit]))
+    levels = built([limits, equal(np.eye(2), [5.0, 5.0])])
+    assert claim(levels, [1.0, 1.0]).is_optimal(levels)
+    assert not claim(levels, [1.0, 5.0]).is_optimal(levels)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-9, 1e-15])
+def test_a_level_in_small_units_below_one_in_large_units_is_judged_in_its_own(unit):
+    problem = [equal([[1, 1, 0], [1, 1, 0]], [1, 2]), equal([[unit, 0, unit]], [unit])]
+    levels = built(problem)
+    best, _ = lexicographic_optimum(problem)
+    assert claim(levels, best).is_optimal(levels)
+    assert not claim(levels, best + np.array([STEP, -STEP, 0.0])).is_optimal(levels)
+
+
 def test_a_bound_may_push_inwards_only():
     levels = built([Rows(np.array([[1.0]]), np.array([-INF]), np.array([1.0])), equal([[1]], [0])])
     pulling = np.zeros((2, 2))

@@ -355,7 +355,7 @@ def test_a_new_hand_is_a_folder_named_by_its_path_or_as_text(tmp_path):
 
 
 def test_an_unknown_robot_lists_the_known_ones():
-    with pytest.raises(InputError, match="unknown robot 'shadow'.*bhand, wam_bhand"):
+    with pytest.raises(InputError, match=r"unknown robot 'shadow'.*bhand, wam_bhand"):
         RobotDescription.load("shadow")
 
 
@@ -443,7 +443,7 @@ def test_a_name_that_the_model_lacks_comes_with_those_it_has(tmp_path, old, new,
 
 def test_where_there_is_nothing_to_choose_from_the_message_says_none(tmp_path):
     xml = XML[: XML.index("  <keyframe>")] + "</mujoco>"
-    with pytest.raises(ModelError, match="no keyframe 'home' in .*keyframes are: none"):
+    with pytest.raises(ModelError, match=r"no keyframe 'home' in .*keyframes are: none"):
         build(tmp_path, xml)
 
 
@@ -460,7 +460,7 @@ def test_only_hinges_and_slides_are_accepted(tmp_path, joint):
     xml = change(XML, '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>', joint)
     qpos = "1 " + "0 " * (3 if "ball" in joint else 6)
     xml = change(xml, 'qpos="0 0.2 0.1"', f'qpos="{qpos} 0.2 0.1"')
-    with pytest.raises(ModelError, match="joint 'lift' of .* is neither hinge nor slide"):
+    with pytest.raises(ModelError, match=r"joint 'lift' of .* is neither hinge nor slide"):
         build(tmp_path, xml)
 
 
@@ -478,16 +478,14 @@ def test_couplings_that_contradict_one_another_are_refused(tmp_path):
 def test_a_coupling_through_a_tendon_that_is_not_fixed_is_refused(tmp_path):
     head, tail = TWO_TENDONS.split('<fixed name="cable">')
     tail = tail[tail.index("</fixed>") + len("</fixed>") :]
-    spatial = (
-        '<spatial name="cable"><site site="palm"/><site site="tip_center"/></spatial>'
-    )
+    spatial = '<spatial name="cable"><site site="palm"/><site site="tip_center"/></spatial>'
     with pytest.raises(ModelError, match="tendon 'cable' couples joints but is not fixed"):
         build(tmp_path, head + spatial + tail)
 
 
 def test_a_tip_that_is_no_sphere_is_refused(tmp_path):
     xml = change(XML, 'type="sphere" size="0.01"', 'type="box" size="0.01 0.01 0.01"')
-    with pytest.raises(ModelError, match="geom 'tip' of .* must be a sphere"):
+    with pytest.raises(ModelError, match=r"geom 'tip' of .* must be a sphere"):
         build(tmp_path, xml)
 
 

@@ -13,7 +13,7 @@ from hqp_grasp.scene import OBJECT, Cylinder, Prism, Scene
 
 SQUARE = ((0.03, -0.03), (0.03, 0.03), (-0.03, 0.03), (-0.03, -0.03))
 LOPSIDED = ((0.09, -0.01), (0.02, 0.07), (-0.04, 0.03), (-0.02, -0.05))
-PENTAGRAM = tuple((np.cos(a), np.sin(a)) for a in 4 * np.pi / 5 * np.arange(5))
+PENTAGRAM = np.array([(np.cos(a), np.sin(a)) for a in 4 * np.pi / 5 * np.arange(5)])
 # MuJoCo keeps meshes in single precision, and finds distances to them by iteration.
 MESH_TOL = 1e-7  # [m]
 EXACT_TOL = 1e-12  # [m]
@@ -52,7 +52,10 @@ def test_a_prism_has_a_finite_height_and_side_above_zero(bad):
         pytest.param((*SQUARE, SQUARE[0]), "strictly convex", id="repeated corner"),
         pytest.param(np.add(SQUARE, (0.1, 0.0)), "around the origin", id="origin outside"),
         pytest.param(np.add(SQUARE, (0.03, 0.0)), "around the origin", id="origin on an edge"),
-        pytest.param(PENTAGRAM, "strictly convex", id="pentagram"),
+        *(
+            pytest.param(np.roll(PENTAGRAM, i, axis=0), "strictly convex", id=f"pentagram {i}")
+            for i in range(5)
+        ),
     ],
 )
 def test_a_prism_stands_on_a_convex_polygon_around_the_origin(polygon, message):
@@ -73,6 +76,12 @@ def test_a_regular_prism_has_the_sides_asked_for_and_a_corner_on_the_x_axis():
         np.testing.assert_allclose(np.linalg.norm(edges, axis=1), 0.04, rtol=1e-12)
         np.testing.assert_allclose(corners.mean(axis=0), 0.0, atol=1e-15)
         assert corners[0, 0] > 0 and corners[0, 1] == 0
+
+
+@pytest.mark.parametrize("first", range(6))
+def test_any_corner_of_a_polygon_may_come_first(first):
+    hexagon = Prism.regular(6, 0.05).polygon
+    assert Prism(hexagon[first:] + hexagon[:first]).polygon[0] == hexagon[first]
 
 
 def test_equal_objects_and_scenes_are_equal_values():
@@ -123,7 +132,7 @@ def test_distances_to_a_prism_are_those_to_its_polygon(tip_over, polygon):
     expected = np.array([nearest_on_polygon(polygon, p[:2])[0] for p in offsets]) - tiny_hand.TIP
     outside = expected > 0.0
     assert outside.sum() > 100
-    found = tip_over(Prism(polygon), (0.3, -0.2, 0.1), offsets[outside])
+    found = tip_over(Prism(polygon, 0.4), (0.3, -0.2, 0.1), offsets[outside])
     np.testing.assert_allclose(found, expected[outside], atol=MESH_TOL)
 
 
@@ -134,7 +143,7 @@ def test_the_corners_of_a_prism_are_found_where_they_were_asked_for(tip_over):
     for height in (-0.19, 0.0, 0.19):
         offsets = np.column_stack([corners + gap * away, np.full(len(corners), height)])
         expected = [nearest_on_polygon(corners, p[:2])[0] - tiny_hand.TIP for p in offsets]
-        found = tip_over(Prism(LOPSIDED), position, offsets)
+        found = tip_over(Prism(LOPSIDED, 0.4), position, offsets)
         np.testing.assert_allclose(found, expected, atol=MESH_TOL)
 
 
@@ -150,7 +159,7 @@ def test_distances_to_a_cylinder_are_those_to_its_circle(tip_over):
     offsets = rng.uniform((-0.15, -0.15, -0.19), (0.15, 0.15, 0.19), size=(200, 3))
     expected = np.array([nearest_on_circle(0.05, p[:2])[0] for p in offsets]) - tiny_hand.TIP
     outside = expected > 0.0
-    found = tip_over(Cylinder(0.05), (0.3, -0.2, 0.1), offsets[outside])
+    found = tip_over(Cylinder(0.05, 0.4), (0.3, -0.2, 0.1), offsets[outside])
     np.testing.assert_allclose(found, expected[outside], atol=EXACT_TOL)
 
 
@@ -194,12 +203,12 @@ def test_a_scene_with_a_robot_from_elsewhere_travels_too(tmp_path):
 
 @pytest.mark.parametrize("thing", ["cylinder", None, Cylinder, 0.05])
 def test_an_unknown_object_lists_the_known_ones(thing):
-    with pytest.raises(InputError, match="unknown object .*Cylinder, Prism"):
+    with pytest.raises(InputError, match=r"unknown object .*Cylinder, Prism"):
         Scene(object=thing)
 
 
 def test_an_unknown_robot_is_refused_before_anything_is_compiled():
-    with pytest.raises(InputError, match="unknown robot 'hook'.*bhand, wam_bhand"):
+    with pytest.raises(InputError, match=r"unknown robot 'hook'.*bhand, wam_bhand"):
         Scene(robot="hook")
 
 

@@ -1,0 +1,188 @@
+"""Throw random hierarchies at the solver; none may raise, diverge, or miss its certificate.
+
+    python benchmarks/fuzz.py --problems 100000 --seed 0 --solver daqp --jobs 2
+
+Problem i of seed s draws from SeedSequence([s, i]) and from nothing else, so that a failure listed
+as `i` is repeated by `--seed s --first i --problems 1`. The answer may also be compared with the
+reference optimum of the tests, computed slowly in many digits.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from hqp_grasp import HQP, InputError, Level
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from oracle import OracleError, lexicographic_optimum
+from problems import Rows, general, three_level
+
+CHUNK = 50  # problems handed to a worker at once
+SHOWN = 40  # failures listed at most
+AGREEMENT = 1e-6  # of x, and of a level's miss in units of its rows, with the reference
+
+
+@dataclass(frozen=True)
+class Options:
+    """Random hierarchies: never an exception, never a non-finite x, always certified."""
+
+    problems: int = 5000
+    """How many."""
+    seed: int = 0
+    """Problem i draws from SeedSequence([seed, i])."""
+    first: int = 0
+    """Index of the first problem: to repeat one, or to continue."""
+    solver: str = "proxqp"
+    """The QP solver."""
+    kind: Literal["general", "three_level-easy", "three_level-mid", "three_level-hard"] = "general"
+    """general: n 1–40, 1–8 levels, anything goes. three_level: 11 unknowns, a box, three tasks."""
+    against_oracle: bool = False
+    """Compare with the reference optimum too (some 20 problems a second and job)."""
+    shortcuts: bool = True
+    """Turned off, every problem goes through the QP solver."""
+    jobs: int = 2
+    """Worker processes."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one problem."""
+
+    index: int
+    method: str  # the way that led to the answer, "none" where no way did
+    tried: int  # ways that failed before it
+    seconds: float
+    fault: str = ""  # empty: as it should be
+    detail: str = ""
+
+
+def make(kind: str, seed: int, index: int) -> list[Rows]:
+    """The problem that (kind, seed, index) names."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
+    if kind == "general":
+        return general(rng)
+    return three_level(rng, kind.removeprefix("three_level-"))
+
+
+def attempt(options: Options, index: int) -> Outcome:
+    """Solve one problem and look for faults."""
+    problem = make(options.kind, options.seed, index)
+    levels = [Level(*rows) for rows in problem]
+    hqp = HQP(solver=options.solver, shortcuts=options.shortcuts)
+    started = time.perf_counter()
+    try:
+        answer = hqp.solve(levels)
+    except Exception as error:  # none is allowed: whatever it is, it is counted
+        seconds = time.perf_counter() - started
+        return Outcome(index, "none", 0, seconds, type(error).__name__, str(error))
+    seconds = time.perf_counter() - started
+    outcome = partial(Outcome, index, answer.method, len(answer.failed), seconds)
+    if not np.isfinite(answer.x).all():
+        return outcome("not finite", str(answer.x))
+    if not answer.is_optimal(levels):
+        return outcome("not certified", "")
+    if options.against_oracle:
+        try:
+            x, misses = lexicographic_optimum(problem)
+        except OracleError as error:
+            return outcome("no reference", str(error))
+        detail = disagreement(levels, answer.x, x, misses)
+        if detail:
+            return outcome("not the optimum", detail)
+    return outcome()
+
+
+def disagreement(levels: list[Level], x: np.ndarray, known: np.ndarray, misses: list) -> str:
+    """Where x leaves the reference; x itself counts where its last level determines it."""
+    for k, (level, miss) in enumerate(zip(levels, misses, strict=True)):
+        nearest = np.clip(level.A @ x, level.lower, level.upper)
+        unit = np.abs(nearest) + np.linalg.norm(level.A, axis=1) * np.linalg.norm(x)
+        ours, theirs = np.linalg.norm(level.residual(x)), np.linalg.norm(miss)
+        if abs(ours - theirs) > AGREEMENT * np.linalg.norm(unit):
+            return f"level {k} is missed by {ours:.3e}, least is {theirs:.3e}"
+    last = levels[-1].A
+    determined = len(last) >= len(x) and np.linalg.cond(last) < 1 / AGREEMENT
+    gap = np.max(np.abs(x - known), initial=0.0)
+    if determined and gap > AGREEMENT * (1.0 + np.max(np.abs(known))):
+        return f"x is {gap:.1e} away"
+    return ""
+
+
+def attempts(options: Options, indices: range) -> list[Outcome]:
+    """A chunk of problems, in one worker."""
+    return [attempt(options, index) for index in indices]
+
+
+def run(options: Options) -> Iterator[Outcome]:
+    """Outcomes in the order of their index."""
+    stop = options.first + options.problems
+    chunks = [range(i, min(i + CHUNK, stop)) for i in range(options.first, stop, CHUNK)]
+    work = partial(attempts, options)
+    if options.jobs == 1:
+        for chunk in chunks:
+            yield from work(chunk)
+        return
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")  # one BLAS thread a worker, read as it starts
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+        for outcomes in pool.map(work, chunks):
+            yield from outcomes
+
+
+def report(options: Options, outcomes: list[Outcome]) -> int:
+    """Print the tables; return the number of failures."""
+    total = len(outcomes)
+    print(f"\n{total} problems, {options.kind}, seed {options.seed}, solver {options.solver}\n")
+    print(f"{'way':<20}{'problems':>10}{'share':>9}{'median':>12}{'p99':>12}")
+    for method, count in Counter(o.method for o in outcomes).most_common():
+        times = 1e6 * np.array([o.seconds for o in outcomes if o.method == method])
+        median, late = np.median(times), np.percentile(times, 99)
+        print(f"{method:<20}{count:>10}{count / total:>9.2%}{median:>9.0f} µs{late:>9.0f} µs")
+    failures = [o for o in outcomes if o.fault]
+    print(f"\n{'fault':<20}{'problems':>10}")
+    for fault in ("not finite", "not certified"):
+        print(f"{fault:<20}{sum(o.fault == fault for o in failures):>10}")
+    if options.against_oracle:
+        print(f"{'not the optimum':<20}{sum(o.fault == 'not the optimum' for o in failures):>10}")
+    known = {"not finite", "not certified", "not the optimum"}
+    others = Counter(o.fault for o in failures if o.fault not in known)
+    for fault, count in others.most_common():
+        print(f"{fault:<20}{count:>10}")
+    if not others:
+        print(f"{'exceptions':<20}{0:>10}")
+    for o in failures[:SHOWN]:
+        print(f"  --seed {options.seed} --first {o.index} --problems 1: {o.fault} {o.detail[:300]}")
+    if len(failures) > SHOWN:
+        rest = ", ".join(str(o.index) for o in failures[SHOWN:])
+        print(f"  and {rest}")
+    return len(failures)
+
+
+def main(options: Options) -> None:
+    if min(options.problems, options.jobs) < 1 or min(options.seed, options.first) < 0:
+        sys.exit("fuzz: problems and jobs must be ≥ 1, seed and first ≥ 0")
+    try:
+        hqp = HQP(solver=options.solver)
+    except InputError as error:
+        sys.exit(f"fuzz: {error}")
+    hqp.solve([Level.equal([[1.0]], [1.0])])  # compiles, or loads what was compiled
+    progress = tqdm(run(options), total=options.problems, unit="problem", smoothing=0.05)
+    sys.exit(1 if report(options, list(progress)) else 0)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
