@@ -20,6 +20,7 @@ CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
 ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
+VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 SIGNED = 1e-10  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
 
 OPTIMAL, CYCLING = 0, 1
@@ -410,6 +411,13 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
         for j in range(n):
             length += x[j] * x[j]
         length = np.sqrt(length)
+        for k in range(p):  # where x vanishes by cancellation, what the levels ask of it counts
+            s = 0.0
+            for i in range(off[k], off[k + 1]):
+                if act[i] != 0:
+                    s += target[i] * target[i]
+            if frobenius[k] > 0.0:
+                length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
         for i in range(M):
             slack[i] = FEASIBLE * row_norm[i] * length
         # Rows that x breaks.

@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 from hqp_grasp.errors import InputError
 
 EPS = float(np.finfo(float).eps)
+VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 CERTIFICATE_TOLERANCE = 1e-8  # [–] row-scaled; what `is_optimal` asks unless told otherwise
 
 
@@ -156,9 +157,15 @@ def stack(levels: Sequence[Level]) -> Stacked:
     upper = np.concatenate([level.upper for level in levels])
     offsets = np.array([0, *(len(level.A) for level in levels)]).cumsum()
     squares = np.einsum("ij,ij->i", A, A)
-    sums = np.concatenate(([0.0], squares.cumsum()))
-    frobenius = np.sqrt(sums[offsets[1:]] - sums[offsets[:-1]])
+    frobenius = np.sqrt(_level_sums(squares, offsets))
     return Stacked(A, lower, upper, offsets, lower == upper, np.sqrt(squares), frobenius)
+
+
+def _level_sums(values: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Sum of the values (M,) of each level (p,); a level without rows sums to 0."""
+    sums = np.add.reduceat(np.append(values, 0.0), offsets[:-1])
+    sums[offsets[1:] == offsets[:-1]] = 0.0
+    return sums
 
 
 def optimality_faults(
@@ -180,7 +187,7 @@ def optimality_faults(
     level = np.repeat(np.arange(p), np.diff(rows.offsets))
     value = A @ x
     nearest = np.clip(value, rows.lower, rows.upper)
-    length = float(np.linalg.norm(x))
+    length = _length(rows, x, nearest)
     unit = np.abs(nearest) + rows.row_norm * length  # what a row's rounding is measured by
     room = tol * unit
     w = value - nearest
@@ -195,9 +202,8 @@ def optimality_faults(
     gradient = A.T @ forces  # (n, columns)
     if least_norm:
         gradient[:, p] += x
-    units = np.sqrt(np.add.reduceat(np.append(unit**2, 0.0), rows.offsets[:-1]))
-    units[np.diff(rows.offsets) == 0] = 0.0
-    left = rank_tolerance * np.sqrt(np.add.reduceat(np.append(w**2, 0.0), rows.offsets[:-1]))
+    units = np.sqrt(_level_sums(unit**2, rows.offsets))
+    left = rank_tolerance * np.sqrt(_level_sums(w**2, rows.offsets))
     scale = np.append(rows.frobenius * (tol * units + left), tol * length)[:columns]
     push = forces * rows.row_norm[:, None]
     wrong = above & (
@@ -215,6 +221,14 @@ def optimality_faults(
             name = "least norm of x" if k == p else f"level {k}"
             faults.append(f"{name}: imbalance {rest:.1e} exceeds {scale[k]:.1e}")
     return faults
+
+
+def _length(rows: Stacked, x: np.ndarray, nearest: np.ndarray) -> float:
+    """‖x‖, or where x vanishes by cancellation a small part of what the levels ask of it."""
+    asked = np.sqrt(_level_sums(nearest**2, rows.offsets))
+    some = rows.frobenius > 0.0
+    natural = (asked[some] / rows.frobenius[some]).max(initial=0.0)
+    return max(float(np.linalg.norm(x)), VANISHED * float(natural))
 
 
 def _least_imbalance(
