@@ -22,9 +22,11 @@ from hqp_grasp.level import (
     stack,
 )
 
-QUICK_ROUNDS = 8  # rounds of the active-set search before the backend is asked
+QUICK_ROUNDS = 5  # rounds of the active-set search before it moves one row at a time,
+QUICK_PIVOTS = 60  # and steps of that before the backend is asked
 POLISH_ROUNDS = 20  # rounds allowed to settle the active set that a backend names
-PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method
+PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
+LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
 BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
 STRONG = 1e-6  # [–] scaled slack or dual above which a backend's row counts as active
 RIDGE = 1e-9  # [–] added to a backend's Hessian; its answer only names the active set
@@ -79,7 +81,7 @@ class HQP:
             if warm is not None and len(warm.active) == len(act):
                 act = np.where(rows.equal, 2, np.where(warm.active == 2, 0, warm.active))
                 act = _possible(act.astype(np.int8), rows)
-            found = self._settle(levels, rows, act, "shortcut", failed, QUICK_ROUNDS, 0)
+            found = self._settle(levels, rows, act, "shortcut", failed, QUICK_ROUNDS, QUICK_PIVOTS)
             if found is not None:
                 return found
         try:
@@ -90,9 +92,8 @@ class HQP:
             found = self._settle(levels, rows, act, self.solver, failed, POLISH_ROUNDS, 0)
             if found is not None:
                 return found
-        pivots = PIVOTS_PER_ROW * (len(rows.A) + rows.A.shape[1])
-        act = equalities.copy()
-        found = self._settle(levels, rows, act, "one row at a time", failed, 0, pivots)
+        act = _loosened_active_set(rows, equalities.copy())
+        found = self._settle(levels, rows, act, "one row at a time", failed, POLISH_ROUNDS, 0)
         if found is not None:
             return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
@@ -137,6 +138,30 @@ class HQP:
             status = "nearest" if unmet[own].any() else "met"
             reports.append(LevelReport(level.name, residual[own], int(rank[k]), status))
         return Solution(x, tuple(reports), act, multipliers[:, :-1], method, tuple(failed), left)
+
+
+def _loosened_active_set(rows: Stacked, act: np.ndarray) -> np.ndarray:
+    """The active set of a problem whose bounds are a little apart, each by another amount.
+
+    Where many rows meet in one point, moving one row at a time can go in circles; ties broken
+    like this, it cannot. What it finds is then settled with the true bounds.
+    """
+    size = np.abs(np.clip(0.0, rows.lower, rows.upper)) + rows.row_norm
+    apart = LOOSEN * size * np.random.default_rng(0).uniform(1.0, 2.0, len(act))
+    apart[rows.equal] = 0.0
+    active_set.search(
+        rows.A,
+        rows.lower - apart,
+        rows.upper + apart,
+        rows.offsets,
+        act,
+        rows.frobenius,
+        rows.row_norm,
+        -1.0,
+        0,
+        PIVOTS_PER_ROW * sum(rows.A.shape),
+    )
+    return act
 
 
 def _possible(act: np.ndarray, rows: Stacked) -> np.ndarray:
