@@ -33,7 +33,8 @@ from problems import Rows, general, three_level
 
 CHUNK = 50  # problems handed to a worker at once
 SHOWN = 40  # failures listed at most
-AGREEMENT = 1e-6  # of x, and of a level's miss in units of its rows, with the reference
+AGREEMENT = 1e-6  # of ‖x‖, and of a level's miss in units of its rows, with the reference
+FLOOR = 1e-9  # of the size of the problem: AGREEMENT × FLOOR of it is rounding
 
 
 @dataclass(frozen=True)
@@ -107,19 +108,35 @@ def attempt(options: Options, index: int) -> Outcome:
 
 
 def disagreement(levels: list[Level], x: np.ndarray, known: np.ndarray, misses: list) -> str:
-    """Where x leaves the reference; x itself counts where its last level determines it."""
+    """Where x leaves the reference: a level's miss, or a length that is not the least."""
+    length = np.linalg.norm(x) + FLOOR * reach(levels)
     for k, (level, miss) in enumerate(zip(levels, misses, strict=True)):
         nearest = np.clip(level.A @ x, level.lower, level.upper)
-        unit = np.abs(nearest) + np.linalg.norm(level.A, axis=1) * np.linalg.norm(x)
+        unit = np.abs(nearest) + np.linalg.norm(level.A, axis=1) * length
         ours, theirs = np.linalg.norm(level.residual(x)), np.linalg.norm(miss)
         if abs(ours - theirs) > AGREEMENT * np.linalg.norm(unit):
             return f"level {k} is missed by {ours:.3e}, least is {theirs:.3e}"
-    last = levels[-1].A
-    determined = len(last) >= len(x) and np.linalg.cond(last) < 1 / AGREEMENT
-    gap = np.max(np.abs(x - known), initial=0.0)
-    if determined and gap > AGREEMENT * (1.0 + np.max(np.abs(known))):
-        return f"x is {gap:.1e} away"
+    excess = np.linalg.norm(x) - np.linalg.norm(known)
+    if excess > AGREEMENT * length:
+        return f"x is {excess:.1e} longer than need be"
     return ""
+
+
+def reach(levels: list[Level]) -> float:
+    """The largest distance from x = 0 to a bound that it breaks: the size of the problem."""
+    return max(
+        (
+            abs(w) / norm
+            for level in levels
+            for w, norm in zip(
+                level.residual(np.zeros(level.A.shape[1])),
+                np.linalg.norm(level.A, axis=1),
+                strict=True,
+            )
+            if norm
+        ),
+        default=0.0,
+    )
 
 
 def attempts(options: Options, indices: range) -> list[Outcome]:

@@ -11,6 +11,7 @@ from hqp_grasp.errors import (
 )
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.hqp import HQP, solvers
+from hqp_grasp.ik import ik_levels, solve_ik
 from hqp_grasp.level import Level, LevelReport, Solution
 from hqp_grasp.limits import ConfigurationLimit, Limit, MinkLimit, StepLimit, VelocityLimit
 from hqp_grasp.probe import GeometricProbe, Miss, Missed, Probe
@@ -68,5 +69,7 @@ __all__ = [
     "Task",
     "Trial",
     "VelocityLimit",
+    "ik_levels",
+    "solve_ik",
     "solvers",
 ]

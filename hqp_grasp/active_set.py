@@ -15,15 +15,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-EPS = float(np.finfo(np.float64).eps)
+from hqp_grasp.certificate import EPS, VANISHED
+
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
 ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
-VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 SIGNED = 1e-10  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
-
-OPTIMAL, CYCLING = 0, 1
 
 
 @njit(cache=True, error_model="numpy")
@@ -363,6 +361,16 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
 
 
 @njit(cache=True, error_model="numpy")
+def equalities(lower, upper):
+    """The active set of the equalities alone, (M,) int8."""
+    act = np.zeros(len(lower), np.int8)
+    for i in range(len(lower)):
+        if lower[i] == upper[i]:
+            act[i] = 2
+    return act
+
+
+@njit(cache=True, error_model="numpy")
 def _wrong_sign(i, k_own, side, w, lam, room, row_norm, scale):
     """Level at which active row i holds x from the wrong side (−1: none), and by how much."""
     if abs(w) > room:
@@ -385,7 +393,8 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
     First up to `blocks` rounds that take in every violated row and let go every row of wrong sign
     at once; they are fast and need not end. Then up to `pivots` steps of the primal method that
     moves one row at a time and improves the levels in their order at every step (as LexLSI,
-    Dimitrov, Sherikov & Wieber 2015). Returns x, w, lam, rank, status, rounds.
+    Dimitrov, Sherikov & Wieber 2015). Returns x, lam and rank as `solve_active` does; whether the
+    search ended or ran out of steps is for the certificate to find out.
     """
     M, n = A.shape
     p = len(off) - 1
@@ -484,5 +493,5 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
         if drop >= 0:
             act[drop] = 0
         if not changed:
-            return x, w, lam, rank, OPTIMAL, step + 1
-    return x, w, lam, rank, CYCLING, blocks + pivots
+            break
+    return x, lam, rank

@@ -11,6 +11,7 @@ import proxsuite
 import qpsolvers
 
 from hqp_grasp import active_set
+from hqp_grasp.certificate import measure, optimality_faults
 from hqp_grasp.errors import InputError, SolverError, one_of
 from hqp_grasp.level import (
     CERTIFICATE_TOLERANCE,
@@ -18,7 +19,6 @@ from hqp_grasp.level import (
     LevelReport,
     Solution,
     Stacked,
-    optimality_faults,
     stack,
 )
 
@@ -74,26 +74,33 @@ class HQP:
         where no way leads to an answer that passes its certificate.
         """
         rows = stack(levels)
-        equalities = np.where(rows.equal, 2, 0).astype(np.int8)
+        norms = measure(rows.A, rows.offsets)
+        equalities = active_set.equalities(rows.lower, rows.upper)
         failed: list[str] = []
         if self.shortcuts:
             act = equalities.copy()
             if warm is not None and len(warm.active) == len(act):
-                act = np.where(rows.equal, 2, np.where(warm.active == 2, 0, warm.active))
-                act = _possible(act.astype(np.int8), rows)
-            found = self._settle(levels, rows, act, "shortcut", failed, QUICK_ROUNDS, QUICK_PIVOTS)
+                held = np.abs(warm.active) == 1
+                act[held & (act == 0)] = warm.active[held & (act == 0)]
+                _possible(act, rows)
+            found = self._settle(
+                levels, rows, norms, act, "shortcut", failed, QUICK_ROUNDS, QUICK_PIVOTS
+            )
             if found is not None:
                 return found
         try:
-            act = _cascade(rows, OWN_INTERFACE.get(self.solver) or _through_qpsolvers(self.solver))
+            backend = OWN_INTERFACE.get(self.solver) or _through_qpsolvers(self.solver)
+            act = _cascade(rows, norms, backend)
         except _BackendError as failure:
             failed.append(f"{self.solver}: {failure}")
         else:
-            found = self._settle(levels, rows, act, self.solver, failed, POLISH_ROUNDS, 0)
+            found = self._settle(levels, rows, norms, act, self.solver, failed, POLISH_ROUNDS, 0)
             if found is not None:
                 return found
-        act = _loosened_active_set(rows, equalities.copy())
-        found = self._settle(levels, rows, act, "one row at a time", failed, POLISH_ROUNDS, 0)
+        act = _loosened_active_set(rows, norms, equalities.copy())
+        found = self._settle(
+            levels, rows, norms, act, "one row at a time", failed, POLISH_ROUNDS, 0
+        )
         if found is not None:
             return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
@@ -102,6 +109,7 @@ class HQP:
         self,
         levels: Sequence[Level],
         rows: Stacked,
+        norms: tuple[np.ndarray, np.ndarray],
         act: np.ndarray,
         method: str,
         failed: list[str],
@@ -109,54 +117,66 @@ class HQP:
         pivots: int,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
-        x, _, multipliers, rank, _, _ = active_set.search(
+        row_norm, frobenius = norms
+        left = self.rank_tolerance or 0.0
+        x, multipliers, rank = active_set.search(
             rows.A,
             rows.lower,
             rows.upper,
             rows.offsets,
             act,
-            rows.frobenius,
-            rows.row_norm,
-            -1.0 if self.rank_tolerance is None else self.rank_tolerance,
+            frobenius,
+            row_norm,
+            -1.0 if self.rank_tolerance is None else left,
             rounds,
             pivots,
         )
-        n = rows.A.shape[1]
-        tol, left = CERTIFICATE_TOLERANCE, self.rank_tolerance or 0.0
-        shortest = bool(rank.sum() < n)
-        faults = optimality_faults(rows, x, multipliers, tol, left, least_norm=shortest)
+        shortest = int(rank.sum()) < len(x)
+        residual, faults = optimality_faults(
+            rows.A,
+            rows.lower,
+            rows.upper,
+            rows.offsets,
+            x,
+            multipliers,
+            CERTIFICATE_TOLERANCE,
+            left,
+            shortest,
+        )
         if faults:
             failed.append(f"{method}: {faults[0]}")
             return None
-        value = rows.A @ x
-        residual = value - np.clip(value, rows.lower, rows.upper)
-        room = tol * (np.abs(value) + rows.row_norm * float(np.linalg.norm(x)))
-        unmet = np.abs(residual) > room
         reports = []
+        begin = 0
         for k, level in enumerate(levels):
-            own = slice(rows.offsets[k], rows.offsets[k + 1])
-            status = "nearest" if unmet[own].any() else "met"
-            reports.append(LevelReport(level.name, residual[own], int(rank[k]), status))
-        return Solution(x, tuple(reports), act, multipliers[:, :-1], method, tuple(failed), left)
+            w = residual[begin : begin + len(level.lower)]
+            begin += len(w)
+            reports.append(
+                LevelReport(level.name, w, int(rank[k]), "nearest" if w.any() else "met")
+            )
+        return Solution(x, tuple(reports), act, multipliers, method, tuple(failed), left)
 
 
-def _loosened_active_set(rows: Stacked, act: np.ndarray) -> np.ndarray:
+def _loosened_active_set(
+    rows: Stacked, norms: tuple[np.ndarray, np.ndarray], act: np.ndarray
+) -> np.ndarray:
     """The active set of a problem whose bounds are a little apart, each by another amount.
 
     Where many rows meet in one point, moving one row at a time can go in circles; ties broken
     like this, it cannot. What it finds is then settled with the true bounds.
     """
-    size = np.abs(np.clip(0.0, rows.lower, rows.upper)) + rows.row_norm
+    row_norm, frobenius = norms
+    size = np.abs(np.clip(0.0, rows.lower, rows.upper)) + row_norm
     apart = LOOSEN * size * np.random.default_rng(0).uniform(1.0, 2.0, len(act))
-    apart[rows.equal] = 0.0
+    apart[act == 2] = 0.0
     active_set.search(
         rows.A,
         rows.lower - apart,
         rows.upper + apart,
         rows.offsets,
         act,
-        rows.frobenius,
-        rows.row_norm,
+        frobenius,
+        row_norm,
         -1.0,
         0,
         PIVOTS_PER_ROW * sum(rows.A.shape),
@@ -164,14 +184,13 @@ def _loosened_active_set(rows: Stacked, act: np.ndarray) -> np.ndarray:
     return act
 
 
-def _possible(act: np.ndarray, rows: Stacked) -> np.ndarray:
+def _possible(act: np.ndarray, rows: Stacked) -> None:
     """Let go of rows held at a bound that is infinite."""
     infinite = ((act == 1) & np.isinf(rows.upper)) | ((act == -1) & np.isinf(rows.lower))
     act[infinite] = 0
-    return act
 
 
-def _cascade(rows: Stacked, backend: Backend) -> np.ndarray:
+def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray], backend: Backend) -> np.ndarray:
     """Let a QP solver name the active rows, level by level in the freedom that is left.
 
     Equalities, rows that cannot be met and rows held by a strong dual are frozen for the levels
@@ -179,20 +198,22 @@ def _cascade(rows: Stacked, backend: Backend) -> np.ndarray:
     """
     A, n = rows.A, rows.A.shape[1]
     act = np.zeros(len(A), dtype=np.int8)
-    unit = np.where(rows.row_norm > 0.0, rows.row_norm, 1.0)
+    row_norm, frobenius = norms
+    is_equal = rows.lower == rows.upper
+    unit = np.where(row_norm > 0.0, row_norm, 1.0)
     x = np.zeros(n)
     Z = np.eye(n)
     standing = np.zeros(0, dtype=int)  # inequality rows above that are met and not frozen
-    p = len(rows.frobenius)
+    p = len(frobenius)
     for k in range(p + 1):
         own = np.arange(rows.offsets[k], rows.offsets[k + 1]) if k < p else np.zeros(0, dtype=int)
         own = own[~(np.isinf(rows.lower[own]) & np.isinf(rows.upper[own]))]
-        equal, soft = own[rows.equal[own]], own[~rows.equal[own]]
+        equal, soft = own[is_equal[own]], own[~is_equal[own]]
         act[equal] = 2
         d, slacks = Z.shape[1], len(soft)
         duals = np.zeros(len(standing))
         if d:
-            scale = rows.frobenius[k] if k < p and rows.frobenius[k] > 0.0 else 1.0
+            scale = frobenius[k] if k < p and frobenius[k] > 0.0 else 1.0
             M = (A[equal] @ Z if k < p else Z) / scale
             r = (A[equal] @ x - rows.upper[equal] if k < p else x) / scale
             P = np.zeros((d + slacks, d + slacks))
@@ -229,7 +250,8 @@ def _cascade(rows: Stacked, backend: Backend) -> np.ndarray:
             rest = A[frozen] @ Z / unit[frozen, None]
             _, sigma, Vt = np.linalg.svd(rest)
             Z = Z @ Vt[int((sigma > 1e-9).sum()) :].T
-    return _possible(act, rows)
+    _possible(act, rows)
+    return act
 
 
 def _proxqp(

@@ -1,17 +1,16 @@
-"""Priority levels, solutions, and the optimality certificate: algebra only."""
+"""Priority levels, and solutions that certify themselves: algebra only."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
-from scipy.optimize import nnls
 
+from hqp_grasp.certificate import optimality_faults
 from hqp_grasp.errors import InputError
 
-EPS = float(np.finfo(float).eps)
-VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 CERTIFICATE_TOLERANCE = 1e-8  # [–] row-scaled; what `is_optimal` asks unless told otherwise
 
 
@@ -128,7 +127,17 @@ class Solution:
         that.
         """
         rows = stack(levels)
-        return not optimality_faults(rows, self.x, self.multipliers, tol, self.rank_tolerance)
+        _, faults = optimality_faults(
+            rows.A,
+            rows.lower,
+            rows.upper,
+            rows.offsets,
+            self.x,
+            self.multipliers,
+            tol,
+            self.rank_tolerance,
+        )
+        return not faults
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +148,6 @@ class Stacked:
     lower: np.ndarray  # (M,)
     upper: np.ndarray  # (M,)
     offsets: np.ndarray  # (p + 1,) level k owns rows offsets[k]:offsets[k+1]
-    equal: np.ndarray  # (M,) bool
-    row_norm: np.ndarray  # (M,) ‖a_i‖
-    frobenius: np.ndarray  # (p,) ‖A_k‖_F
 
 
 def stack(levels: Sequence[Level]) -> Stacked:
@@ -155,99 +161,5 @@ def stack(levels: Sequence[Level]) -> Stacked:
         raise InputError(f"levels disagree on the number of unknowns: {widths}") from error
     lower = np.concatenate([level.lower for level in levels])
     upper = np.concatenate([level.upper for level in levels])
-    offsets = np.array([0, *(len(level.A) for level in levels)]).cumsum()
-    squares = np.einsum("ij,ij->i", A, A)
-    frobenius = np.sqrt(_level_sums(squares, offsets))
-    return Stacked(A, lower, upper, offsets, lower == upper, np.sqrt(squares), frobenius)
-
-
-def _level_sums(values: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Sum of the values (M,) of each level (p,); a level without rows sums to 0."""
-    sums = np.add.reduceat(np.append(values, 0.0), offsets[:-1])
-    sums[offsets[1:] == offsets[:-1]] = 0.0
-    return sums
-
-
-def optimality_faults(
-    rows: Stacked,
-    x: np.ndarray,
-    multipliers: np.ndarray,
-    tol: float,
-    rank_tolerance: float = 0.0,
-    least_norm: bool = False,
-) -> list[str]:
-    """What keeps x from being certified as the optimum of the hierarchy; empty where nothing does.
-
-    `multipliers` (M, p) or, with least_norm, (M, p + 1): the last column then shows that x is the
-    shortest of all optima.
-    """
-    if not np.isfinite(x).all():
-        return ["x is not finite"]
-    A, p = rows.A, len(rows.offsets) - 1
-    level = np.repeat(np.arange(p), np.diff(rows.offsets))
-    value = A @ x
-    nearest = np.clip(value, rows.lower, rows.upper)
-    length = _length(rows, x, nearest)
-    unit = np.abs(nearest) + rows.row_norm * length  # what a row's rounding is measured by
-    room = tol * unit
-    w = value - nearest
-    w[np.abs(w) <= room] = 0.0
-    may_push_up = may_push_down = rows.equal | (w != 0.0)
-    may_push_up = may_push_up | (value >= rows.upper - room)
-    may_push_down = may_push_down | (value <= rows.lower + room)
-    columns = p + 1 if least_norm else p
-    above = level[:, None] < np.arange(columns)
-    forces = np.where(above, multipliers[:, :columns], 0.0)
-    forces[np.arange(len(w)), level] = w
-    gradient = A.T @ forces  # (n, columns)
-    if least_norm:
-        gradient[:, p] += x
-    units = np.sqrt(_level_sums(unit**2, rows.offsets))
-    left = rank_tolerance * np.sqrt(_level_sums(w**2, rows.offsets))
-    scale = np.append(rows.frobenius * (tol * units + left), tol * length)[:columns]
-    push = forces * rows.row_norm[:, None]
-    wrong = above & (
-        ((push > scale) & ~may_push_up[:, None]) | ((push < -scale) & ~may_push_down[:, None])
-    )
-    unbalanced = np.abs(gradient).max(axis=0, initial=0.0) > scale
-    faults = []
-    for k in np.flatnonzero(unbalanced | wrong.any(axis=0)):
-        pull = x if k == p else A[level == k].T @ w[level == k]
-        over = level < k
-        rest = _least_imbalance(
-            pull, A[over], may_push_up[over], may_push_down[over], rows.row_norm[over]
-        )
-        if rest > scale[k]:
-            name = "least norm of x" if k == p else f"level {k}"
-            faults.append(f"{name}: imbalance {rest:.1e} exceeds {scale[k]:.1e}")
-    return faults
-
-
-def _length(rows: Stacked, x: np.ndarray, nearest: np.ndarray) -> float:
-    """‖x‖, or where x vanishes by cancellation a small part of what the levels ask of it."""
-    asked = np.sqrt(_level_sums(nearest**2, rows.offsets))
-    some = rows.frobenius > 0.0
-    natural = (asked[some] / rows.frobenius[some]).max(initial=0.0)
-    return max(float(np.linalg.norm(x)), VANISHED * float(natural))
-
-
-def _least_imbalance(
-    pull: np.ndarray, A: np.ndarray, up: np.ndarray, down: np.ndarray, norm: np.ndarray
-) -> float:
-    """min ‖pull + Aᵀ λ‖ over λ ≥ 0 where only `up`, ≤ 0 where only `down`, free where both."""
-    real = norm > 0.0
-    unit = A[real] / norm[real, None]
-    up, down = up[real], down[real]
-    free = unit[up & down]
-    signed = np.concatenate([unit[up & ~down], -unit[down & ~up]])
-    if len(free):
-        _, sigma, Vt = np.linalg.svd(free, full_matrices=False)
-        basis = Vt[sigma > EPS * max(free.shape) * sigma[0]]
-        for _ in range(2):
-            pull = pull - basis.T @ (basis @ pull)
-            signed = signed - (signed @ basis.T) @ basis
-    size = float(np.linalg.norm(pull))
-    if size == 0.0 or not len(signed):
-        return size
-    _, rest = nnls(signed.T, -pull / size, maxiter=30 * (1 + len(signed)))
-    return float(rest) * size
+    offsets = np.array([0, *accumulate(len(level.lower) for level in levels)])
+    return Stacked(A, lower, upper, offsets)

@@ -124,7 +124,7 @@ class MinkLimit(Limit):
 
     @property
     def rank(self) -> Rank:  # type: ignore[override]
-        if isinstance(self.limit, mink.VelocityLimit):
+        if isinstance(self.limit, mink.VelocityLimit | mink.FreeJointVelocityLimit):
             return Rank.CAP
         if isinstance(self.limit, mink.ConfigurationLimit):
             return Rank.RANGE

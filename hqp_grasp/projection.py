@@ -39,7 +39,7 @@ class Projection:
     def solve(self, levels: Sequence[Level]) -> Solution:
         """Answer levels of equality rows only; raise InputError for any inequality row."""
         rows = stack(levels)
-        if not rows.equal.all():
+        if not (rows.lower == rows.upper).all():
             k = next(k for k, v in enumerate(levels) if not (v.lower == v.upper).all())
             raise InputError(
                 f"Projection takes equality rows only, and level {k} has inequalities: "

@@ -47,16 +47,28 @@ def solve(problem, solver=ANY, **options):
     return answer
 
 
-def units(rows, x):
+def units(rows, x, floor=0.0):
     nearest = np.clip(rows.A @ x, rows.lower, rows.upper)
-    return np.linalg.norm(np.abs(nearest) + np.linalg.norm(rows.A, axis=1) * np.linalg.norm(x))
+    length = np.linalg.norm(x) + floor
+    return np.linalg.norm(np.abs(nearest) + np.linalg.norm(rows.A, axis=1) * length)
+
+
+def rounding(problem):
+    """A length of x that is none: 1e-15 of the way to the farthest bound that x = 0 breaks."""
+    far = 0.0
+    for A, lower, upper in problem:
+        norm = np.linalg.norm(A, axis=1)
+        bound = np.abs(np.clip(0.0, lower, upper))[norm > 0]
+        far = max(far, np.max(bound / norm[norm > 0], initial=0.0))
+    return 1e-15 * far
 
 
 def assert_same_misses(problem, x, misses):
     """Every level is missed by as much as the optimum misses it, neither more nor less."""
-    for k, (rows, known) in enumerate(zip(problem, misses, strict=True)):
+    floor = rounding(problem) / TOL
+    for k, (rows, known) in enumerate(zip(problem, misses, strict=False)):
         ours = np.linalg.norm(Level(*rows).residual(x))
-        room = TOL * units(rows, x)
+        room = TOL * units(rows, x, floor)
         assert abs(ours - np.linalg.norm(known)) <= room, f"level {k}"
 
 
@@ -103,7 +115,10 @@ def test_sizes_of_real_robots_are_answered_exactly(n, levels, shortcuts):
 def test_anything_that_can_be_built_is_missed_by_as_little_as_possible(seed):
     problem = fuzz(seed, max_n=12, max_levels=5, max_rows=6)
     answer = solve(problem, ("proxqp", "daqp")[seed % 2])
-    assert_same_misses(problem, answer.x, lexicographic_optimum(problem)[1])
+    known, misses = lexicographic_optimum(problem)
+    assert_same_misses(problem, answer.x, misses)
+    # and of the optima, none is shorter
+    assert np.linalg.norm(answer.x) <= (1.0 + TOL) * np.linalg.norm(known) + rounding(problem)
 
 
 @pytest.mark.parametrize("seed", range(100))
@@ -197,6 +212,17 @@ def test_the_shortest_is_sought_within_the_limits(solver, shortcuts):
     problem = [wide, equal([[1, 1]], [2])]  # without the limit: [1, 1]
     answer = solve(problem, solver, shortcuts=shortcuts)
     assert_same_point(answer.x, [0.5, 1.5])
+
+
+@pytest.mark.parametrize("index", [135, 386, 533, 1495, 2081, 2273])
+def test_rows_that_were_in_the_way_once_are_let_go_for_a_shorter_answer(index, shortcuts):
+    """Problems in which rows that held x during the search leave no freedom if they are kept."""
+    problem = general(np.random.default_rng(np.random.SeedSequence([5, index])))
+    known, misses = lexicographic_optimum(problem)
+    for solver in ("proxqp", "daqp"):
+        answer = solve(problem, solver, shortcuts=shortcuts)
+        assert_same_misses(problem, answer.x, misses)
+        assert_same_point(answer.x, known)
 
 
 def test_nothing_asked_is_nothing_done(solver, shortcuts):

@@ -1,0 +1,178 @@
+"""Whether x is the lexicographic optimum of a hierarchy: a check that shares nothing with solvers.
+
+Level k is optimal, given those above, when A_kᵀ w_k + Σ_{j<k} A_jᵀ λ_jk = 0 for multipliers that
+only push the way a row can: either way for equalities and for rows that cannot be met, inwards
+for rows at a bound, not at all for the others. A pull that is found wanting is judged anew with
+the best multipliers there are, by non-negative least squares.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.optimize import nnls
+
+EPS = float(np.finfo(float).eps)
+VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
+SIGN_PASSES = 8  # rounds of mending signs before the least-squares search is asked
+
+
+@njit(cache=True, error_model="numpy")
+def measure(A, off):
+    """Row norms (M,) and the levels' Frobenius norms (p,)."""
+    M, n = A.shape
+    row_norm = np.empty(M)
+    frobenius = np.empty(len(off) - 1)
+    for k in range(len(off) - 1):
+        total = 0.0
+        for i in range(off[k], off[k + 1]):
+            s = 0.0
+            for j in range(n):
+                s += A[i, j] * A[i, j]
+            row_norm[i] = np.sqrt(s)
+            total += s
+        frobenius[k] = np.sqrt(total)
+    return row_norm, frobenius
+
+
+@njit(cache=True, error_model="numpy")
+def check(A, lower, upper, off, x, lam, tol, left, least_norm):
+    """Residuals, and which columns of `lam` (M, p or p + 1) fail to prove their level optimal.
+
+    `left`: rank tolerance; a level may leave that part of its residual. With least_norm, column
+    p must prove that x is the shortest optimum. Returns w (M,) with residuals of the size of
+    rounding set to 0, push (M,) 0 where a row may not push, 1 upwards, −1 downwards, 2 both,
+    imbalance (columns,) and scale (columns,): what is wrong, and how much of that counts as none.
+    """
+    M, n = A.shape
+    p = len(off) - 1
+    columns = p + 1 if least_norm else p
+    row_norm, frobenius = measure(A, off)
+    w = np.empty(M)
+    nearest = np.empty(M)
+    natural = 0.0
+    length = 0.0
+    for j in range(n):
+        length += x[j] * x[j]
+    length = np.sqrt(length)
+    for k in range(p):
+        asked = 0.0
+        for i in range(off[k], off[k + 1]):
+            s = 0.0
+            for j in range(n):
+                s += A[i, j] * x[j]
+            nearest[i] = min(max(s, lower[i]), upper[i])
+            w[i] = s - nearest[i]
+            asked += nearest[i] * nearest[i]
+        if frobenius[k] > 0.0:
+            natural = max(natural, np.sqrt(asked) / frobenius[k])
+    length = max(length, VANISHED * natural)
+    scale = np.empty(columns)
+    push = np.zeros(M, np.int8)
+    own = np.empty(M, np.int64)
+    for k in range(p):
+        units = 0.0
+        rest = 0.0
+        for i in range(off[k], off[k + 1]):
+            own[i] = k
+            unit = abs(nearest[i]) + row_norm[i] * length
+            units += unit * unit
+            room = tol * unit
+            value = nearest[i] + w[i]
+            if abs(w[i]) <= room:
+                w[i] = 0.0
+            rest += w[i] * w[i]
+            up = value >= upper[i] - room
+            down = value <= lower[i] + room
+            if w[i] != 0.0 or lower[i] == upper[i] or (up and down):
+                push[i] = 2
+            elif up:
+                push[i] = 1
+            elif down:
+                push[i] = -1
+        scale[k] = frobenius[k] * (tol * np.sqrt(units) + left * np.sqrt(rest))
+    if least_norm:
+        scale[p] = tol * length
+    forces = np.zeros((M, columns))
+    for i in range(M):
+        if own[i] < columns:
+            forces[i, own[i]] = w[i]
+        for k in range(own[i] + 1, columns):
+            forces[i, k] = lam[i, k]
+    imbalance = np.zeros(columns)
+    for k in range(columns):
+        wrong = True
+        for _ in range(SIGN_PASSES):
+            wrong = False
+            for i in range(off[min(k, p)]):
+                force = forces[i, k] * row_norm[i]
+                if abs(force) <= scale[k] or push[i] == 2 or force * push[i] > 0.0:
+                    continue
+                wrong = True
+                # A row that holds a level between must not give way: lean on that level's proof.
+                for between in range(own[i] + 1, k):
+                    other = forces[i, between] * row_norm[i]
+                    if push[i] != 0 and other * push[i] > scale[between]:
+                        t = -force / other
+                        for r in range(off[between + 1]):
+                            forces[r, k] += t * forces[r, between]
+                        scale[k] += t * scale[between]
+                        break
+            if not wrong:
+                break
+        worst = 0.0
+        for j in range(n):
+            s = x[j] if k == p else 0.0
+            for i in range(off[min(k + 1, p)]):
+                s += A[i, j] * forces[i, k]
+            worst = max(worst, abs(s))
+        imbalance[k] = np.inf if wrong else worst
+    return w, push, imbalance, scale
+
+
+def optimality_faults(
+    A: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    off: np.ndarray,
+    x: np.ndarray,
+    multipliers: np.ndarray,
+    tol: float,
+    left: float = 0.0,
+    least_norm: bool = False,
+) -> tuple[np.ndarray, list[str]]:
+    """Residuals w (M,), and what keeps x from being certified: an empty list where nothing does."""
+    if not np.isfinite(x).all():
+        return np.full(len(A), np.nan), ["x is not finite"]
+    w, push, imbalance, scale = check(A, lower, upper, off, x, multipliers, tol, left, least_norm)
+    faults = []
+    for k in np.flatnonzero(~(imbalance <= scale)):
+        last = k == len(off) - 1
+        above = slice(0, off[k])
+        own = slice(off[k], off[k + 1]) if not last else slice(0, 0)
+        pull = x if last else A[own].T @ w[own]
+        rest = _least_imbalance(pull, A[above], push[above])
+        if not rest <= scale[k]:
+            name = "least norm of x" if last else f"level {k}"
+            faults.append(f"{name}: imbalance {rest:.1e} exceeds {scale[k]:.1e}")
+    return w, faults
+
+
+def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray) -> float:
+    """min ‖pull + Aᵀ λ‖ over λ free where push is 2, of push's sign where ±1, 0 where 0."""
+    norm = np.linalg.norm(A, axis=1)
+    real = norm > 0.0
+    unit, push = A[real] / norm[real, None], push[real]
+    free = unit[push == 2]
+    signed = np.concatenate([unit[push == 1], -unit[push == -1]])
+    if len(free):
+        _, sigma, Vt = np.linalg.svd(free, full_matrices=False)
+        basis = Vt[sigma > EPS * max(free.shape) * sigma[0]]
+        for _ in range(2):
+            pull = pull - basis.T @ (basis @ pull)
+            signed = signed - (signed @ basis.T) @ basis
+    size = float(np.linalg.norm(pull))
+    if size == 0.0 or not len(signed):
+        return size
+    _, rest = nnls(signed.T, -pull / size, maxiter=30 * (1 + len(signed)))
+    return float(rest) * size
