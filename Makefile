@@ -6,6 +6,8 @@ PYTEST_ARGS ?=       # such as `-n 2`, to run tests in two processes
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip install --quiet --no-input --disable-pip-version-check
+# numba compiles the solver at its first call and keeps what it made: half a minute, once.
+COMPILE := $(PY) -c 'import numpy as n, hqp_grasp as h; h.HQP().solve([h.Level.equal(n.eye(2), n.ones(2))])'
 # One stamp for each state of $(VENV), so that nothing is installed twice.
 MADE := $(VENV)/.made
 READY := $(VENV)/.ready
@@ -51,16 +53,19 @@ clean:
 $(READY): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp into $(VENV) (once)'
 	@$(PIP) --editable .
+	@$(COMPILE)
 	@touch $@
 
 $(READY_DEV): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and its tools into $(VENV) (once)'
 	@$(PIP) --editable '.[test,dev,docs]'
+	@$(COMPILE)
 	@touch $(READY) $@
 
 $(READY_BENCH): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and its peers into $(VENV) (once)'
 	@$(PIP) --editable '.[bench]'
+	@$(COMPILE)
 	@touch $(READY) $@
 
 # The first Python that is new enough builds $(VENV), or the message says what to install.
