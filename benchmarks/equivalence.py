@@ -3,8 +3,7 @@
     python benchmarks/equivalence.py --trials 10 --probes 40 --seed 0
 
 Where limits are active the forms part: the second table says what each leaves of the force law,
-the first of the laws (see limits.py for the forms). It also says how often the hierarchy's contacts
-move off the surface less than those of the clipped projection: that law stands above force.
+the first of the laws (see limits.py for the forms).
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ class Seen:
     lost: int = 0  # trials
     gap_x: list[float] = field(default_factory=list)  # [rad], no limit active
     gap_rows: list[float] = field(default_factory=list)  # in the laws' own units
-    method: set[str] = field(default_factory=set)
     left: dict[str, list[float]] = field(default_factory=dict)  # force [N], a limit active
 
     @property
@@ -102,8 +100,8 @@ def main(
         print(f"{shape:18}{name:8}{count + row.active:8}{share:>12}{gaps}{row.lost:6}")
     print("\na limit active: force left by one step [N], median and max; share above hierarchy's")
     forms = ("hierarchy", "clipped", "SR-inverse", "paper")
-    print(f"{'':26}{'active':>7}" + "".join(f"{form:>{17 if k == 0 else 22}}" for k, form in
-        enumerate(forms)))
+    head = "".join(f"{form:>{17 if form == 'hierarchy' else 22}}" for form in forms)
+    print(f"{'':26}{'active':>7}{head}")
     for (shape, name), row in seen.items():
         if not row.active:
             continue

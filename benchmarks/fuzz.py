@@ -196,7 +196,7 @@ def main(options: Options) -> None:
         hqp = HQP(solver=options.solver)
     except InputError as error:
         sys.exit(f"fuzz: {error}")
-    hqp.solve([Level.equal([[1.0]], [1.0])])  # compiles, or loads what was compiled
+    hqp.solve([Level.equal(np.eye(1), np.ones(1))])  # compiles, or loads what was compiled
     progress = tqdm(run(options), total=options.problems, unit="problem", smoothing=0.05)
     sys.exit(1 if report(options, list(progress)) else 0)
 

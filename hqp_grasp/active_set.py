@@ -19,6 +19,7 @@ from hqp_grasp.certificate import EPS, VANISHED
 
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
+DUST = 1.0 * EPS  # [–] of a row, for each turn: what is left of it when it has nothing new to say
 ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
 SIGNED = 1e-10  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
@@ -144,8 +145,13 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                 ma += 1
     start[p] = ma
     W = np.empty((ma, n))
+    length = np.empty(ma)
     for i in range(ma):
-        W[i] = A[rows[i]]
+        s = 0.0
+        for j in range(n):
+            W[i, j] = A[rows[i], j]
+            s += W[i, j] * W[i, j]
+        length[i] = np.sqrt(s)
     H = np.empty((ma, n))  # the reflector made from each picked row,
     beta = np.empty(ma)
     made = np.zeros(p, np.int64)  # and how many each level made
@@ -172,17 +178,22 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
             r = 0
             ambiguous = False
             while r < steps:
-                best = -1.0
+                best = 0.0
                 pick = lo + r
                 for i in range(lo + r, hi):
                     s = 0.0
                     for j in range(c + r, n):
                         s += W[i, j] * W[i, j]
+                    dust = DUST * (c + r) * length[i]
+                    if s <= dust * dust:
+                        for j in range(c + r, n):
+                            W[i, j] = 0.0
+                        continue
                     if s > best:
                         best = s
                         pick = i
                 norm = np.sqrt(best)
-                if norm <= rough / (CLEAR * 10.0):
+                if best == 0.0 or norm <= rough / (CLEAR * 10.0):
                     break
                 if norm <= rough * CLEAR:
                     ambiguous = True
@@ -190,6 +201,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                     rows[pick], rows[lo + r] = rows[lo + r], rows[pick]
                     for j in range(n):
                         W[pick, j], W[lo + r, j] = W[lo + r, j], W[pick, j]
+                    length[pick], length[lo + r] = length[lo + r], length[pick]
                 d = c + r
                 row = lo + r
                 alpha = -norm if W[row, d] > 0.0 else norm

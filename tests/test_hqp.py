@@ -94,7 +94,7 @@ def test_answers_known_by_hand(name, shortcuts):
 
 @pytest.mark.parametrize("difficulty", ["easy", "mid", "hard"])
 def test_every_solver_gives_the_reference_optimum(difficulty, solver, shortcuts):
-    for seed in range(4):
+    for seed in range(3):
         problem = three_level(np.random.default_rng(seed), difficulty)
         x, misses = lexicographic_optimum(problem)
         answer = solve(problem, solver, shortcuts=shortcuts)
@@ -153,7 +153,7 @@ def test_a_limit_in_small_units_beside_one_in_large_units_is_kept(unit, shortcut
 # ---------------------------------------------------------------- strict
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(40))
 def test_lower_levels_never_worsen_those_above(seed):
     if seed % 2:
         problem = three_level(np.random.default_rng(seed), ("easy", "mid", "hard")[seed % 3])

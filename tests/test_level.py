@@ -241,7 +241,7 @@ def attempts(rng, levels, x):
                 yield x + side * length * d / np.linalg.norm(d)
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(30))
 def test_a_step_away_from_the_optimum_is_rejected(seed):
     rng = np.random.default_rng(seed)
     if seed % 2:
@@ -264,7 +264,7 @@ def test_steps_that_make_nothing_worse_are_rare_among_those_tried():
 
 def test_the_optimum_of_another_order_is_rejected():
     told_apart = 0
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         levels = built(three_level(rng, "hard"))
         best, _ = lexicographic_optimum(levels)
@@ -274,7 +274,7 @@ def test_the_optimum_of_another_order_is_rejected():
                 told_apart += 1
                 assert not claim(levels, other).is_optimal(levels)
                 assert claim(levels, other).is_optimal([levels[k] for k in order])
-    assert told_apart > 12
+    assert told_apart > 8
 
 
 def test_a_point_outside_its_limits_is_rejected_however_well_it_does_below():
@@ -333,7 +333,7 @@ def forged(rng, levels, x, kind):
 
 @pytest.mark.parametrize("kind", ["balancing", "random", 1e300, INF, -INF, np.nan])
 def test_no_evidence_makes_a_wrong_answer_right(kind):
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         levels = built(three_level(rng, "hard"))
         best, _ = lexicographic_optimum(levels)
