@@ -8,10 +8,11 @@ order, at blocks of problems. What is timed:
 
     HQP         levels built from arrays, solved from cold, certified
     hg.solve_ik the same by way of mink's tasks and limits, its own signature
-    mink, pink  solve_ik with daqp: one QP, the tasks weighted by costs from 1e3 down to 1e-3. The
-                robot is a chain of hinges whose ranges are the box; tasks return the rows ready made,
-                so that a robot's kinematics is in none of the times
-    daqp        one call with break_points; it scales rows, and so resolves conflicts in its own norm
+    mink, pink  solve_ik with daqp: one QP, the tasks weighted by costs from 1e3 down to 1e-3.
+                The robot is a chain of hinges whose ranges are the box; tasks return the rows
+                ready made, so that a robot's kinematics is in none of the times
+    daqp        one call with break_points; it scales rows, and so resolves what cannot be met
+                in a norm of its own
     projection  the strict recursion; it knows no limits
 
 Wrong is an answer farther than 1e-6 from the reference optimum (tests/oracle.py).

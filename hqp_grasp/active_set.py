@@ -21,8 +21,9 @@ CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
 DUST = 1.0 * EPS  # [–] of a row, for each turn: what is left of it when it has nothing new to say
 ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
+STILL = 1e-9  # [–] of the way to a level's optimum: a shorter step is no progress
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
-SIGNED = 1e-10  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
+SIGNED = 1e-15  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
 
 
 @njit(cache=True, error_model="numpy")
@@ -157,6 +158,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
     made = np.zeros(p, np.int64)  # and how many each level made
     xq = np.zeros(n)
     wa = np.zeros(ma)
+    dim = np.zeros(ma)  # rounding of wa
     first = np.zeros(p + 1, np.int64)  # level k owns coordinates first[k]:first[k+1]
     triangular = np.ones(p, np.bool_)
     T = np.zeros((ma, n))  # thin orthogonal factors of the L_k that are not triangular
@@ -297,6 +299,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                 size += abs(W[i, j] * xq[j])
             if abs(wa[i]) <= ROUNDING * size:
                 wa[i] = 0.0
+            dim[i] = DUST * size
     x = xq.copy()
     for k in range(p - 1, -1, -1):  # x = Q xq, the factors of Q from the last to the first
         a, r = first[k], made[k]
@@ -320,7 +323,9 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
         w[rows[i]] = wa[i]
     rank = first[1:] - first[:-1]
     lam = np.zeros((M, p + 1))
+    doubt = np.zeros((M, p + 1))
     g = np.empty(n)
+    h = np.empty(n)  # what is doubtful of g
     for k in range(p + 1):
         if k < p:
             lo, hi = start[k], start[k + 1]
@@ -328,19 +333,23 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
             some = False
             for j in range(top):
                 g[j] = 0.0
+                h[j] = 0.0
             for i in range(lo, hi):
                 if wa[i] != 0.0:
                     some = True
+                    size = SIGNED * abs(wa[i]) + dim[i]
+                    dust = 4.0 * DUST * length[i] * abs(wa[i])
                     for j in range(top):
-                        g[j] += W[i, j] * wa[i]
+                        if W[i, j] != 0.0:
+                            g[j] += W[i, j] * wa[i]
+                            h[j] += abs(W[i, j]) * size + dust
             if not some:
                 continue
         else:
             top = c
-            if c == n:
-                continue
             for j in range(c):
                 g[j] = xq[j]
+                h[j] = np.inf
         for l in range(min(k, p) - 1, -1, -1):
             lo, hi = start[l], start[l + 1]
             a, r = first[l], first[l + 1] - first[l]
@@ -349,27 +358,41 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
             if triangular[l]:  # Lᵀ λ = −g
                 for i in range(r - 1, -1, -1):
                     s = -g[a + i]
+                    size = h[a + i]
                     for j in range(i + 1, r):
                         s -= W[lo + j, a + i] * lam[rows[lo + j], k]
+                        size += abs(W[lo + j, a + i]) * doubt[rows[lo + j], k]
                     lam[rows[lo + i], k] = s / W[lo + i, a + i]
+                    doubt[rows[lo + i], k] = size / abs(W[lo + i, a + i])
             else:  # λ = −T R⁻ᵀ g, the least-norm one
                 z = np.empty(r)
+                y = np.empty(r)
                 for i in range(r):
                     s = -g[a + i]
+                    size = h[a + i]
                     for j in range(i):
                         s -= R[a + j, a + i] * z[j]
+                        size += abs(R[a + j, a + i]) * y[j]
                     z[i] = s / R[a + i, a + i]
+                    y[i] = size / R[a + i, a + i]
                 for i in range(lo, hi):
                     s = 0.0
+                    size = 0.0
                     for j in range(r):
                         s += T[i, a + j] * z[j]
+                        size += abs(T[i, a + j]) * y[j]
                     lam[rows[i], k] = s
+                    doubt[rows[i], k] = size
             for i in range(lo, hi):
                 s = lam[rows[i], k]
                 if s != 0.0:
+                    size = doubt[rows[i], k]
+                    dust = 4.0 * DUST * length[i] * abs(s)
                     for j in range(a):
-                        g[j] += W[i, j] * s
-    return x, w, lam, rank
+                        if W[i, j] != 0.0:
+                            g[j] += W[i, j] * s
+                            h[j] += abs(W[i, j]) * size + dust
+    return x, w, lam, doubt, rank
 
 
 @njit(cache=True, error_model="numpy")
@@ -383,7 +406,7 @@ def equalities(lower, upper):
 
 
 @njit(cache=True, error_model="numpy")
-def _wrong_sign(i, k_own, side, w, lam, room, row_norm, scale):
+def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
     """Level at which active row i holds x from the wrong side (−1: none), and by how much."""
     if abs(w) > room:
         if w * side > 0.0:
@@ -391,9 +414,10 @@ def _wrong_sign(i, k_own, side, w, lam, room, row_norm, scale):
         return k_own, abs(w)
     for k in range(k_own + 1, lam.shape[1]):
         push = lam[i, k] * side * row_norm
-        if push > scale[k]:
+        none = min(scale[k], doubt[i, k] * row_norm)
+        if push > none:
             return -1, 0.0
-        if push < -scale[k]:
+        if push < -none:
             return k, -push
     return -1, 0.0
 
@@ -418,6 +442,9 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
         for i in range(off[k], off[k + 1]):
             own[i] = k
     start = np.zeros(n)  # the point the one-row-at-a-time method has reached
+    kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
+    last = -1  # row and side let go in the step before
+    last_side = 0
     for step in range(blocks + pivots):
         single = step >= blocks
         if step == blocks:  # begin again, from x = 0
@@ -427,7 +454,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
         for i in range(M):
             if act[i] != 0:
                 target[i] = upper[i] if act[i] > 0 else lower[i]
-        x, w, lam, rank = solve_active(A, target, off, act, frobenius, rank_tolerance)
+        x, w, lam, doubt, rank = solve_active(A, target, off, act, frobenius, rank_tolerance)
         length = 0.0
         for j in range(n):
             length += x[j] * x[j]
@@ -472,7 +499,14 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
             for j in range(n):
                 start[j] += alpha * (x[j] - start[j])
             act[block] = side
+            # A row let go for good reason cannot be the next one met: its sign was rounding.
+            if block == last and side == last_side:
+                kept[block] = True
+            elif alpha > STILL:
+                kept[:] = False
+            last = -1
             continue
+        last = -1
         start[:] = x
         # Rows that hold x back although a level would gain by letting go.
         for k in range(p):
@@ -488,10 +522,10 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
             if act[i] == 3 or act[i] == -3:
                 act[i] //= 3
                 continue
-            if act[i] == 0 or act[i] == 2:
+            if act[i] == 0 or act[i] == 2 or kept[i]:
                 continue
             room = slack[i] + FEASIBLE * abs(target[i])
-            k, push = _wrong_sign(i, own[i], act[i], w[i], lam, room, row_norm[i], scale)
+            k, push = _wrong_sign(i, own[i], act[i], w[i], lam, doubt, room, row_norm[i], scale)
             if k < 0:
                 continue
             changed = True
@@ -503,6 +537,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
             elif k < level or (k == level and push > worst):
                 drop, level, worst = i, k, push
         if drop >= 0:
+            last, last_side = drop, act[drop]
             act[drop] = 0
         if not changed:
             break

@@ -9,6 +9,7 @@ import daqp
 import numpy as np
 import proxsuite
 import qpsolvers
+from scipy.sparse import csc_matrix
 
 from hqp_grasp import active_set
 from hqp_grasp.certificate import measure, optimality_faults
@@ -29,6 +30,7 @@ PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
 LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
 BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
 STRONG = 1e-6  # [–] scaled slack or dual above which a backend's row counts as active
+ABSURD = 1e100  # a backend's answer beyond this is none
 RIDGE = 1e-9  # [–] added to a backend's Hessian; its answer only names the active set
 
 
@@ -131,7 +133,6 @@ class HQP:
             rounds,
             pivots,
         )
-        shortest = int(rank.sum()) < len(x)
         residual, faults = optimality_faults(
             rows.A,
             rows.lower,
@@ -141,7 +142,7 @@ class HQP:
             multipliers,
             CERTIFICATE_TOLERANCE,
             left,
-            shortest,
+            True,
         )
         if faults:
             failed.append(f"{method}: {faults[0]}")
@@ -226,15 +227,18 @@ def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray], backend: Backe
             G[:, :d] = A[both] @ Z / unit[both, None]
             G[len(standing) :, d:] = -np.eye(slacks)
             base = A[both] @ x
-            y, z = backend(
-                P,
-                q,
-                G,
+            lower, upper = (
                 (rows.lower[both] - base) / unit[both],
                 (rows.upper[both] - base) / unit[both],
             )
-            if not (np.isfinite(y).all() and np.isfinite(z).all()):
-                raise _BackendError(f"level {k}: answer is not finite")
+            try:
+                y, z = backend(P, q, G, lower, upper)
+            except Exception as error:  # whatever a solver raises, another way is tried and told
+                reason = str(error) if isinstance(error, _BackendError) else repr(error)
+                raise _BackendError(f"level {k}: {reason}") from error
+            # NaN compares false
+            if not max(np.abs(y).max(initial=0.0), np.abs(z).max(initial=0.0)) < ABSURD:
+                raise _BackendError(f"level {k}: answer is not finite, or beyond {ABSURD:g}")
             x = x + Z @ y[:d]
             duals = z[: len(standing)]
         value = A[soft] @ x
@@ -290,15 +294,14 @@ def _through_qpsolvers(name: str) -> Backend:
         has_upper, has_lower = np.isfinite(upper), np.isfinite(lower)
         sides = np.concatenate([G[has_upper], -G[has_lower]])
         bounds = np.concatenate([upper[has_upper], -lower[has_lower]])
-        problem = qpsolvers.Problem(P, q, sides, bounds) if len(sides) else qpsolvers.Problem(P, q)
-        try:
-            answer = qpsolvers.solve_problem(problem, name)
-        except (qpsolvers.exceptions.QPError, ValueError, ArithmeticError) as error:
-            raise _BackendError(f"{type(error).__name__}: {error}") from error
+        if name not in qpsolvers.dense_solvers:
+            P, sides = csc_matrix(P), csc_matrix(sides)
+        problem = qpsolvers.Problem(P, q, sides, bounds) if len(bounds) else qpsolvers.Problem(P, q)
+        answer = qpsolvers.solve_problem(problem, name)
         if not answer.found or answer.x is None:
             raise _BackendError("no solution found")
         z = np.zeros(len(G))
-        if len(sides) and answer.z is not None:
+        if len(bounds) and answer.z is not None:
             z[has_upper] += answer.z[: has_upper.sum()]
             z[has_lower] -= answer.z[has_upper.sum() :]
         return np.asarray(answer.x), z

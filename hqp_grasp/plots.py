@@ -34,10 +34,8 @@ def convergence(table: pa.Table, title: str, path: Path) -> None:
     _spread(middle, angle, ANGLE, "")
     middle.set(xlabel="probe", ylabel=r"$\varepsilon_k$ [rad]", ylim=(0.0, None))
     middle.set_title("angle between flexion and normal")
-    last = np.array([row[np.isfinite(row)][-1] for row in adduction])
-    last_elevation = np.array([row[np.isfinite(row)][-1] for row in elevation])
     right.plot(adduction[:, 0], elevation[:, 0], "k.", label="start")
-    right.plot(last, last_elevation, "o", mfc="none", color=MOMENT, label="end")
+    right.plot(_last(adduction), _last(elevation), "o", mfc="none", color=MOMENT, label="end")
     right.set(xlabel="adduction [°]", ylabel="elevation [°]", title="posture of the hand")
     right.legend()
     figure.suptitle(title)
@@ -51,6 +49,11 @@ def _by_trial(table: pa.Table, name: str) -> np.ndarray:
     """One column as (trials, probes), NaN where missing."""
     trials = len(table.column("trial").unique())
     return table.column(name).to_numpy().astype(float).reshape(trials, -1)
+
+
+def _last(values: np.ndarray) -> list[float]:
+    """The last number of each trial, NaN where it has none: not every robot has an adduction."""
+    return [next((v for v in reversed(row) if np.isfinite(v)), np.nan) for row in values]
 
 
 def _spread(axes: Axes, values: np.ndarray, color: str, label: str) -> None:

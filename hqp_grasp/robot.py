@@ -273,8 +273,7 @@ def _texts(value: object) -> tuple[str, ...]:
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a × b along the last axis; np.cross costs several times as much on small arrays."""
-    a, b = np.broadcast_arrays(a, b)
-    out = np.empty(a.shape)
+    out = np.empty((*np.broadcast(a[..., 0], b[..., 0]).shape, 3))
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -93,11 +93,13 @@ def _reach(
     heading = -offset / np.linalg.norm(offset)
     z = np.array([*(np.cos(elevation) * heading), -np.sin(elevation)])
     p_palm = np.array(scene.position) - distance / np.cos(elevation) * z
-    q = robot.home.copy()
+    q = np.clip(robot.home, robot.q_lower, robot.q_upper)
     fixed = [j for (j,) in robot.flexion]
     q[fixed] = robot.q_lower[fixed]
     if robot.description.adduction is not None:
         spread = robot.index(robot.description.adduction)
+        if not robot.q_lower[spread] <= adduction <= robot.q_upper[spread]:
+            return None
         q[spread] = adduction
         fixed.append(spread)
     robot.place(data, q)

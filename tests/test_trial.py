@@ -13,7 +13,6 @@ from hqp_grasp.hqp import HQP
 from hqp_grasp.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.probe import GeometricProbe, Miss, Missed
 from hqp_grasp.projection import Projection
-from hqp_grasp.robot import Robot
 from hqp_grasp.scene import Scene
 from hqp_grasp.stack import Stack
 from hqp_grasp.tasks import ForceTask
@@ -187,10 +186,12 @@ def test_every_form_begins_with_the_same_touch_and_descends(scene, stack, record
     assert force[-1] < 0.1 * force[0]
 
 
-def test_the_loop_runs_without_landing_too(scene, stack, records):
-    record = Trial(scene, stack, probes=PROBES, landing=False).run(SEEDS[0])
+def test_without_landing_short_steps_descend_too(scene, stack, records):
+    short = stack.within(StepLimit(0.05, 0.005), ConfigurationLimit(scene.articulated))
+    record = Trial(scene, short, probes=PROBES, landing=False).run(SEEDS[0])
     assert record.rows[0] == records[SEEDS[0]].rows[0]
-    assert record.converged_at is not None
+    assert not record.lost
+    assert record.rows[-1]["eps_f"] < 0.5 * record.rows[0]["eps_f"]
     assert set(record.column("limit_violation")) == {0.0}
 
 
@@ -254,16 +255,13 @@ def test_a_shorter_step_that_touches_carries_the_trial_on(scene, stack, records,
     np.testing.assert_array_equal(record.grasps[1].q, second.q)
 
 
-def test_a_hand_that_misses_after_some_touches_keeps_what_it_felt(trial, scene, records):
-    hand = Hand(GeometricProbe(scene), touches=records[SEEDS[1]].rejected + 20)
-    count = len(Hand(GeometricProbe(scene)).targets)
-    assert count == 0
+def test_a_trial_that_is_lost_keeps_what_it_felt_before(trial, scene, records):
     full = Hand(GeometricProbe(scene))
     trial.run(SEEDS[1], full)
-    before = len(full.targets) - PROBES  # touches that the start took
-    hand = Hand(GeometricProbe(scene), touches=before + 4)
+    started = len(full.targets) - PROBES  # touches that the start took
+    hand = Hand(GeometricProbe(scene), touches=started + 4)
     record = trial.run(SEEDS[1], hand)
-    assert len(hand.targets) == before + 4 + len(SHARES)
+    assert len(hand.targets) == started + 4 + len(SHARES)
     kept = [*map(but_timings, record.rows[:5])]
     assert kept == [*map(but_timings, records[SEEDS[1]].rows[:5])]
     assert not any(row["in_contact"] for row in record.rows[5:])
@@ -377,3 +375,69 @@ def test_at_a_limit_lower_laws_change_nothing_for_force(tight):
             for letters in ("f", "fmk")
         )
         assert force_left(above, grasp) == pytest.approx(force_left(alone, grasp), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("joint", "old", "side"), [("wam_j1", "-2.6 2.6", 0), ("wam_j6", "-1.6 1.6", 1)]
+)
+def test_with_a_joint_at_its_limit_throughout_only_the_hierarchy_converges(
+    tmp_path, scene, stack, records, joint, old, side
+):
+    first = records[SEEDS[2]].grasps[0]
+    j = scene.articulated.index(joint)
+    new = [float(end) for end in old.split()]
+    new[side] = float(first.q[j])
+    limited = narrowed_scene(tmp_path, scene, joint, old, new)
+    found = {}
+    for form in ("hierarchy", "clipped"):
+        hand = Hand(GeometricProbe(limited), first=first)
+        found[form] = Trial(limited, stack, probes=PROBES, form=form).run(SEEDS[2], hand)
+        assert set(found[form].column("limit_violation")) == {0.0}
+    assert all(row["limit_active"] for row in found["hierarchy"].rows[1:])
+    at = [grasp.q[j] for grasp in found["hierarchy"].grasps]
+    np.testing.assert_allclose(at, new[side], atol=CLIP_TOLERANCE)
+    assert found["hierarchy"].converged_at is not None
+    assert found["clipped"].converged_at is None
+
+
+def test_a_start_outside_a_range_walks_back_within_the_caps(tmp_path, scene, stack, records):
+    """The keyframe of the narrowed robot is outside the range too."""
+    first = records[SEEDS[0]].grasps[0]
+    j = scene.articulated.index("wam_j5")
+    upper = float(first.q[j]) - 0.5
+    limited = narrowed_scene(tmp_path, scene, "wam_j5", "-4.76 1.24", (-4.76, upper))
+    hand = Hand(GeometricProbe(limited), first=first)
+    record = Trial(limited, stack, probes=5).run(SEEDS[0], hand)
+    cap = StepLimit().joint
+    away = [0.5, 0.5 - cap, 0.0, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(record.column("limit_violation"), away, atol=CLIP_TOLERANCE)
+    assert set(record.column("limit_violation")[2:]) == {0.0}
+    assert not record.lost
+
+
+def test_home_outside_a_range_is_no_obstacle_to_a_start(tmp_path, scene, stack):
+    home = scene.articulated.home[scene.articulated.index("wam_j6")]
+    limited = narrowed_scene(tmp_path, scene, "wam_j6", "-1.6 1.6", (-1.6, float(home) - 0.5))
+    record = Trial(limited, stack, probes=1).run(SEEDS[1])
+    assert set(record.column("limit_violation")) == {0.0}
+
+
+def test_a_joint_inside_its_range_stays_there_while_another_walks_back(scene, stack, records):
+    robot = scene.articulated
+    first = records[SEEDS[0]].grasps[0]
+    outside, inside = robot.index("wam_j5"), robot.index("wam_j6")
+    q = first.q.copy()
+    q[outside] = robot.q_upper[outside] + 0.5
+    q[inside] = robot.q_upper[inside]
+    start = dataclasses.replace(first, q=q)
+    hand = Replay(start, first)
+    Trial(scene, stack, probes=1, landing=False).run(SEEDS[0], hand)
+    target = hand.targets[-1]
+    assert target[inside] <= robot.q_upper[inside]
+    assert robot.q_upper[outside] < target[outside] < q[outside]
+
+
+def test_a_stack_with_caps_of_its_own_still_keeps_the_robots_ranges(scene, stack):
+    record = Trial(scene, stack.within(StepLimit()), probes=PROBES).run(SEEDS[2])
+    assert set(record.column("limit_violation")) == {0.0}
+    assert record.converged_at is not None
