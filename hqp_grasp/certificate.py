@@ -15,6 +15,9 @@ from scipy.optimize import nnls
 EPS = float(np.finfo(float).eps)
 VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 SIGN_PASSES = 8  # rounds of mending signs before the least-squares search is asked
+SMALL = 1e-11  # [–] of the largest pull: what is left of it on another unknown by rounding
+LEAN = 1e8  # [–] a level's proof is not added to another's more often than this
+ROUNDING = 1e-13  # [–] of the terms that make up an imbalance; below it, it counts as none
 
 
 @njit(cache=True, error_model="numpy")
@@ -42,7 +45,8 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     `left`: rank tolerance; a level may leave that part of its residual. With least_norm, column
     p must prove that x is the shortest optimum. Returns w (M,) with residuals of the size of
     rounding set to 0, push (M,) 0 where a row may not push, 1 upwards, −1 downwards, 2 both,
-    imbalance (columns,) and scale (columns,): what is wrong, and how much of that counts as none.
+    imbalance (n, columns) and scale (n, columns): what is left of each level's pull on each
+    unknown, and how much of that counts as none: what its own rows' rooms would make up for.
     """
     M, n = A.shape
     p = len(off) - 1
@@ -67,16 +71,14 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
         if frobenius[k] > 0.0:
             natural = max(natural, np.sqrt(asked) / frobenius[k])
     length = max(length, VANISHED * natural)
-    scale = np.empty(columns)
+    scale = np.zeros((n, columns))
     push = np.zeros(M, np.int8)
     own = np.empty(M, np.int64)
     for k in range(p):
-        units = 0.0
         rest = 0.0
         for i in range(off[k], off[k + 1]):
             own[i] = k
             unit = abs(nearest[i]) + row_norm[i] * length
-            units += unit * unit
             room = tol * unit
             value = nearest[i] + w[i]
             if abs(w[i]) <= room:
@@ -90,43 +92,49 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                 push[i] = 1
             elif down:
                 push[i] = -1
-        scale[k] = frobenius[k] * (tol * np.sqrt(units) + left * np.sqrt(rest))
+            if push[i] != 0:
+                for j in range(n):
+                    scale[j, k] += abs(A[i, j]) * room
+        for j in range(n):
+            scale[j, k] += left * frobenius[k] * np.sqrt(rest)
     if least_norm:
-        scale[p] = tol * length
+        scale[:, p] = tol * length
     forces = np.zeros((M, columns))
     for i in range(M):
-        if own[i] < columns:
-            forces[i, own[i]] = w[i]
+        forces[i, own[i]] = w[i]
         for k in range(own[i] + 1, columns):
             forces[i, k] = lam[i, k]
-    imbalance = np.zeros(columns)
+    imbalance = np.empty((n, columns))
     for k in range(columns):
-        wrong = True
         for _ in range(SIGN_PASSES):
-            wrong = False
+            mended = False
             for i in range(off[min(k, p)]):
-                force = forces[i, k] * row_norm[i]
-                if abs(force) <= scale[k] or push[i] == 2 or force * push[i] > 0.0:
+                if push[i] == 2 or forces[i, k] * push[i] > 0.0 or forces[i, k] == 0.0:
                     continue
-                wrong = True
                 # A row that holds a level between must not give way: lean on that level's proof.
+                t = 0.0
                 for between in range(own[i] + 1, k):
-                    other = forces[i, between] * row_norm[i]
-                    if push[i] != 0 and other * push[i] > scale[between]:
-                        t = -force / other
+                    if push[i] != 0 and forces[i, between] * push[i] > 0.0:
+                        t = -forces[i, k] / forces[i, between]
+                        if t > LEAN:
+                            t = 0.0
+                            continue
                         for r in range(off[between + 1]):
                             forces[r, k] += t * forces[r, between]
-                        scale[k] += t * scale[between]
+                        mended = True
                         break
-            if not wrong:
+                if t == 0.0:
+                    forces[i, k] = 0.0  # it may not push like that; what is then missing, shows
+            if not mended:
                 break
-        worst = 0.0
         for j in range(n):
             s = x[j] if k == p else 0.0
+            terms = 0.0
             for i in range(off[min(k + 1, p)]):
                 s += A[i, j] * forces[i, k]
-            worst = max(worst, abs(s))
-        imbalance[k] = np.inf if wrong else worst
+                terms += abs(A[i, j] * forces[i, k])
+            imbalance[j, k] = s
+            scale[j, k] += min(scale[j, k], ROUNDING * terms)  # huge multipliers prove nothing
     return w, push, imbalance, scale
 
 
@@ -146,20 +154,27 @@ def optimality_faults(
         return np.full(len(A), np.nan), ["x is not finite"]
     w, push, imbalance, scale = check(A, lower, upper, off, x, multipliers, tol, left, least_norm)
     faults = []
-    for k in np.flatnonzero(~(imbalance <= scale)):
+    for k in np.flatnonzero(~(np.abs(imbalance) <= scale).all(axis=0)):
         last = k == len(off) - 1
         above = slice(0, off[k])
         own = slice(off[k], off[k + 1]) if not last else slice(0, 0)
         pull = x if last else A[own].T @ w[own]
-        rest = _least_imbalance(pull, A[above], push[above])
-        if not rest <= scale[k]:
+        rest = _least_imbalance(pull, A[above], push[above], scale[:, k])
+        if not rest <= 1.0:
             name = "least norm of x" if last else f"level {k}"
-            faults.append(f"{name}: imbalance {rest:.1e} exceeds {scale[k]:.1e}")
+            faults.append(f"{name}: imbalance is {rest:.1e} of what counts as none")
     return w, faults
 
 
-def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray) -> float:
-    """min ‖pull + Aᵀ λ‖ over λ free where push is 2, of push's sign where ±1, 0 where 0."""
+def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: np.ndarray) -> float:
+    """Largest entry of (pull + Aᵀ λ) / scale for the best λ in the least-squares sense.
+
+    λ is free where push is 2, of push's sign where ±1, and 0 where push is 0.
+    """
+    size = np.maximum(scale, SMALL * np.abs(pull).max())
+    if not pull.any():
+        return 0.0
+    pull, A = pull / size, A / size
     norm = np.linalg.norm(A, axis=1)
     real = norm > 0.0
     unit, push = A[real] / norm[real, None], push[real]
@@ -171,8 +186,8 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray) -> float
         for _ in range(2):
             pull = pull - basis.T @ (basis @ pull)
             signed = signed - (signed @ basis.T) @ basis
-    size = float(np.linalg.norm(pull))
-    if size == 0.0 or not len(signed):
-        return size
-    _, rest = nnls(signed.T, -pull / size, maxiter=30 * (1 + len(signed)))
-    return float(rest) * size
+    length = float(np.linalg.norm(pull))
+    if length == 0.0 or not len(signed):
+        return float(np.abs(pull).max())
+    best, _ = nnls(signed.T, -pull / length, maxiter=30 * (1 + len(signed)))
+    return float(np.abs(pull + length * (signed.T @ best)).max())
