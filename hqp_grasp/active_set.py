@@ -158,7 +158,9 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
     made = np.zeros(p, np.int64)  # and how many each level made
     xq = np.zeros(n)
     wa = np.zeros(ma)
-    dim = np.zeros(ma)  # rounding of wa
+    clean = np.zeros(ma)  # the same, without what is rounding
+    dim = np.zeros(ma)  # how much of wa may be rounding
+    missed = np.zeros(p, np.bool_)  # levels with a residual that is not
     first = np.zeros(p + 1, np.int64)  # level k owns coordinates first[k]:first[k+1]
     triangular = np.ones(p, np.bool_)
     T = np.zeros((ma, n))  # thin orthogonal factors of the L_k that are not triangular
@@ -297,9 +299,9 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
             size = abs(target[rows[i]])
             for j in range(c):
                 size += abs(W[i, j] * xq[j])
-            if abs(wa[i]) <= ROUNDING * size:
-                wa[i] = 0.0
             dim[i] = DUST * size
+            missed[k] |= abs(wa[i]) > ROUNDING * size
+            clean[i] = wa[i] if abs(wa[i]) > ROUNDING * size else 0.0
     x = xq.copy()
     for k in range(p - 1, -1, -1):  # x = Q xq, the factors of Q from the last to the first
         a, r = first[k], made[k]
@@ -320,7 +322,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                 x[j] -= s * H[row, j]
     w = np.zeros(M)
     for i in range(ma):
-        w[rows[i]] = wa[i]
+        w[rows[i]] = clean[i]
     rank = first[1:] - first[:-1]
     lam = np.zeros((M, p + 1))
     doubt = np.zeros((M, p + 1))
@@ -330,26 +332,24 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
         if k < p:
             lo, hi = start[k], start[k + 1]
             top = first[k]
-            some = False
+            if not missed[k]:
+                continue
             for j in range(top):
                 g[j] = 0.0
                 h[j] = 0.0
             for i in range(lo, hi):
                 if wa[i] != 0.0:
-                    some = True
                     size = SIGNED * abs(wa[i]) + dim[i]
                     dust = 4.0 * DUST * length[i] * abs(wa[i])
                     for j in range(top):
                         if W[i, j] != 0.0:
                             g[j] += W[i, j] * wa[i]
                             h[j] += abs(W[i, j]) * size + dust
-            if not some:
-                continue
         else:
             top = c
             for j in range(c):
                 g[j] = xq[j]
-                h[j] = np.inf
+                h[j] = SIGNED * abs(xq[j])
         for l in range(min(k, p) - 1, -1, -1):
             lo, hi = start[l], start[l + 1]
             a, r = first[l], first[l + 1] - first[l]

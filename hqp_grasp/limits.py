@@ -105,7 +105,7 @@ class ConfigurationLimit(Limit):
         return Level(A, (lower - q)[limited], (upper - q)[limited], "range")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MinkLimit(Limit):
     """A limit of mink, G Δq_full ≤ h, carried over to the independent joints: G C x ≤ h."""
 
@@ -121,6 +121,16 @@ class MinkLimit(Limit):
                     f"{type(self.limit).__name__} keeps no model: pass MinkLimit(limit, model)"
                 )
             object.__setattr__(self, "model", model)
+
+    def __repr__(self) -> str:
+        # Says all that mink's limit holds, and no address: results folders are told apart by it.
+        kept = {k: v for k, v in vars(self.limit).items() if not k.startswith("_")}
+        text = ", ".join(
+            f"{k}={np.array2string(np.asarray(v), threshold=10**6)}"
+            for k, v in sorted(kept.items())
+            if isinstance(v, (int, float, str, np.ndarray))
+        )
+        return f"MinkLimit({type(self.limit).__name__}({text}), dt={self.dt})"
 
     @property
     def rank(self) -> Rank:  # type: ignore[override]

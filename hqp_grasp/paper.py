@@ -17,11 +17,11 @@ def contact_step(stack: Stack, grasp: Grasp) -> np.ndarray:
 
     The printed projector has its factors in the wrong order; it is I − J⁺J (3k × 3k). The paper
     leaves the step length open: here it is gain / L with L = 2‖J‖², the largest curvature of
-    ε = eᵀe, so that gain 1 is the longest step that is sure to descend.
+    ε = eᵀe, so that gain 1 has the best descent that is sure.
     """
     step = np.zeros(3 * grasp.k)
     above = np.zeros((0, 3 * grasp.k))
-    for task in _tasks(stack):
+    for task in laws(stack):
         if not isinstance(task, ContactSpaceTask):
             continue
         J = task.contact_jacobian(grasp)
@@ -39,7 +39,7 @@ def paper_levels(stack: Stack, grasp: Grasp) -> list[Level]:
     q̇_c = −gain ∂ε_c/∂q of the stack's kinematic law (eq. 9), 0 where it has none.
     """
     rest = np.zeros(grasp.n)
-    for task in _tasks(stack):
+    for task in laws(stack):
         if isinstance(task, KinematicTask):
             rest -= task.gain * task.gradient(grasp)
     return [
@@ -48,16 +48,21 @@ def paper_levels(stack: Stack, grasp: Grasp) -> list[Level]:
     ]
 
 
-def _tasks(stack: Stack) -> list[ContactSpaceTask | KinematicTask]:
-    tasks = []
+def laws(stack: Stack) -> list[ContactSpaceTask | KinematicTask]:
+    """The laws in the paper's order: contact-space laws, one a priority, then the kinematic."""
+    tasks: list[ContactSpaceTask | KinematicTask] = []
     for beside in stack.priorities:
-        for task in beside:
-            if not isinstance(task, ContactSpaceTask | KinematicTask):
-                raise InputError(
-                    f"the paper's form composes contact-space laws and KinematicTask; "
-                    f"{task.name} is neither"
-                )
-            tasks.append(task)
+        if len(beside) > 1:
+            raise InputError("the paper's form has one law a priority: compose with >>, not +")
+        task = beside[0]
+        if not isinstance(task, ContactSpaceTask | KinematicTask):
+            raise InputError(
+                f"the paper's form composes contact-space laws and KinematicTask; "
+                f"{task.name} is neither"
+            )
+        if tasks and isinstance(tasks[-1], KinematicTask):
+            raise InputError("the paper's form has its kinematic law last; use another form")
+        tasks.append(task)
     return tasks
 
 

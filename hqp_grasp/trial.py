@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import index
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ from hqp_grasp.grasp import Grasp
 from hqp_grasp.hqp import HQP
 from hqp_grasp.level import Level, Solution
 from hqp_grasp.limits import ConfigurationLimit, Rank, StepLimit
-from hqp_grasp.paper import paper_levels
+from hqp_grasp.paper import laws, paper_levels
 from hqp_grasp.probe import GeometricProbe, Missed, Probe
 from hqp_grasp.projection import Projection
 from hqp_grasp.robot import Robot
@@ -108,6 +109,8 @@ class Trial:
     def __post_init__(self) -> None:
         one_of("form", self.form, FORMS)
         one_of("links", self.links, ("pass", "block"))
+        if self.form == "paper":
+            laws(self.stack)  # raises for a stack that has no such form
         if self.probes < 1:
             raise InputError(f"a trial needs at least 1 probe; got {self.probes}")
 
@@ -116,7 +119,7 @@ class Trial:
 
         On a miss the step from the last good grasp is halved, twice; then the trial is lost.
         """
-        entropy = (seed,) if isinstance(seed, int) else tuple(seed)
+        entropy = _entropy(seed)
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         robot = self.scene.articulated
         stack = self.stack
@@ -175,6 +178,17 @@ class Trial:
         return np.where(left, q, clipped)  # a joint that started outside may still be on its way
 
 
+def _entropy(seed: int | Sequence[int]) -> tuple[int, ...]:
+    numbers: Sequence[int] = seed if isinstance(seed, Sequence) else (seed,)
+    try:
+        entropy = tuple(index(number) for number in numbers)
+    except TypeError as error:
+        raise InputError(f"a seed is a whole number, or several; got {seed!r}") from error
+    if not entropy or min(entropy) < 0:
+        raise InputError(f"a seed must be at least 0; got {seed!r}")
+    return entropy
+
+
 @dataclass(frozen=True, eq=False)
 class _Step:
     x: np.ndarray
@@ -187,14 +201,14 @@ class _Step:
 def _step(trial: Trial, stack: Stack, grasp: Grasp, warm: Solution | None) -> _Step:
     """The step that the trial's form asks for at this grasp."""
     if trial.form == "hierarchy":
-        laws = stack.law_levels(grasp)
-        levels = stack.limit_levels(grasp) + laws
+        law_levels = stack.law_levels(grasp)
+        levels = stack.limit_levels(grasp) + law_levels
         begin = time.perf_counter()
         solution = trial.hqp.solve(levels, warm)
         solve_us = 1e6 * (time.perf_counter() - begin)
         gap = None
         if not solution.limit_active:
-            projected = Projection(rank_tolerance=trial.hqp.rank_tolerance).solve(laws)
+            projected = Projection(rank_tolerance=trial.hqp.rank_tolerance).solve(law_levels)
             gap = float(np.abs(solution.x - projected.x).max())
         return _Step(solution.x, solution, solution.limit_active, gap, solve_us)
     begin = time.perf_counter()
@@ -205,7 +219,9 @@ def _step(trial: Trial, stack: Stack, grasp: Grasp, warm: Solution | None) -> _S
     else:
         solution = Projection(damping=SR_DAMPING).solve(paper_levels(stack, grasp))
     solve_us = 1e6 * (time.perf_counter() - begin)
+    robot = trial.scene.articulated
     x = clip_to_limits(solution.x, stack, grasp)
+    x = np.clip(x, robot.q_lower - grasp.q, robot.q_upper - grasp.q)
     return _Step(x, solution, not np.array_equal(x, solution.x), None, solve_us)
 
 
