@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -134,6 +135,13 @@ class Scene:
     def articulated(self) -> Robot:
         """The robot as it stands in this scene's model."""
         return Robot(self.__dict__["_description"], self.model)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the compiled model: a robot's folder may change and keep its name."""
+        model = self.model
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        return hashlib.sha256(buffer.tobytes()).hexdigest()
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.

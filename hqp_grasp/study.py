@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import tempfile
@@ -14,8 +13,6 @@ from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
-import mujoco
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
@@ -53,7 +50,7 @@ class Study:
         """What fixes every figure of the study, timings aside; the number of trials does not."""
         return {
             "trial": repr(self.trial),
-            "model": _digest(self.trial.scene.model),
+            "model": self.trial.scene.fingerprint(),
             "seed": self.seed,
             "versions": {package: version(package) for package in VERSIONS},
         }
@@ -116,13 +113,6 @@ def to_table(record: Record, trial: int, seed: int) -> pa.Table:
         ]
     )
     return pa.table({name: values for name, (_, values, _) in columns.items()}, schema=schema)
-
-
-def _digest(model: mujoco.MjModel) -> str:
-    """A fingerprint of the compiled scene: a robot folder may change and keep its name."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return hashlib.sha256(buffer.tobytes()).hexdigest()
 
 
 def _part(parts: Path, i: int) -> Path:
