@@ -20,6 +20,7 @@ from hqp_grasp.certificate import EPS, VANISHED
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
 DUST = 1.0 * EPS  # [–] of a row, for each turn: what is left of it when it has nothing new to say
+OWN = 16.0  # [–] of the rounding of a residual: a push this small is none
 ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
 STILL = 1e-9  # [–] of the way to a level's optimum: a shorter step is no progress
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
@@ -123,7 +124,7 @@ def _rotate(W, lo, hi, ma, c, r, tol, V):
 
 
 @njit(cache=True, error_model="numpy")
-def solve_active(A, target, off, act, frobenius, rank_tolerance):
+def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
     """Lexicographic least squares of the rows with act ≠ 0, as equalities at `target`.
 
     Returns x (n,), w (M,) the residuals of the active rows, lam (M, p + 1) and rank (p,).
@@ -188,8 +189,8 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                     s = 0.0
                     for j in range(c + r, n):
                         s += W[i, j] * W[i, j]
-                    dust = DUST * (c + r) * length[i]
-                    if s <= dust * dust:
+                    gone = dust * (c + r) * length[i]
+                    if s <= gone * gone:
                         for j in range(c + r, n):
                             W[i, j] = 0.0
                         continue
@@ -339,12 +340,14 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                 h[j] = 0.0
             for i in range(lo, hi):
                 if wa[i] != 0.0:
+                    lam[rows[i], k] = wa[i]
+                    doubt[rows[i], k] = OWN * dim[i]
                     size = SIGNED * abs(wa[i]) + dim[i]
-                    dust = 4.0 * DUST * length[i] * abs(wa[i])
+                    rough = 4.0 * DUST * length[i] * abs(wa[i])
                     for j in range(top):
                         if W[i, j] != 0.0:
                             g[j] += W[i, j] * wa[i]
-                            h[j] += abs(W[i, j]) * size + dust
+                            h[j] += abs(W[i, j]) * size + rough
         else:
             top = c
             for j in range(c):
@@ -387,11 +390,11 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance):
                 s = lam[rows[i], k]
                 if s != 0.0:
                     size = doubt[rows[i], k]
-                    dust = 4.0 * DUST * length[i] * abs(s)
+                    rough = 4.0 * DUST * length[i] * abs(s)
                     for j in range(a):
                         if W[i, j] != 0.0:
                             g[j] += W[i, j] * s
-                            h[j] += abs(W[i, j]) * size + dust
+                            h[j] += abs(W[i, j]) * size + rough
     return x, w, lam, doubt, rank
 
 
@@ -412,6 +415,8 @@ def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
         if w * side > 0.0:
             return -1, 0.0  # the row cannot be met: it is held whatever its sign below
         return k_own, abs(w)
+    if lam[i, k_own] * side > doubt[i, k_own]:
+        return -1, 0.0
     for k in range(k_own + 1, lam.shape[1]):
         push = lam[i, k] * side * row_norm
         none = min(scale[k], doubt[i, k] * row_norm)
@@ -423,7 +428,7 @@ def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
 
 
 @njit(cache=True, error_model="numpy")
-def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, blocks, pivots):
+def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     First up to `blocks` rounds that take in every violated row and let go every row of wrong sign
@@ -454,7 +459,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
         for i in range(M):
             if act[i] != 0:
                 target[i] = upper[i] if act[i] > 0 else lower[i]
-        x, w, lam, doubt, rank = solve_active(A, target, off, act, frobenius, rank_tolerance)
+        x, w, lam, doubt, rank = solve_active(A, target, off, act, frobenius, rank_tolerance, dust)
         length = 0.0
         for j in range(n):
             length += x[j] * x[j]

@@ -27,6 +27,8 @@ QUICK_ROUNDS = 5  # rounds of the active-set search before it moves one row at a
 QUICK_PIVOTS = 60  # and steps of that before the backend is asked
 POLISH_ROUNDS = 20  # rounds allowed to settle the active set that a backend names
 PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
+DRAWS = 2  # times that bounds are drawn apart
+COARSE = 1e-13  # [–] of a row: at last, rows dependent to this are taken as dependent
 LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
 BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
 STRONG = 1e-6  # [–] scaled slack or dual above which a backend's row counts as active
@@ -99,12 +101,20 @@ class HQP:
             found = self._settle(levels, rows, norms, act, self.solver, failed, POLISH_ROUNDS, 0)
             if found is not None:
                 return found
-        act = _loosened_active_set(rows, norms, equalities.copy())
-        found = self._settle(
-            levels, rows, norms, act, "one row at a time", failed, POLISH_ROUNDS, 0
-        )
-        if found is not None:
-            return found
+        steps = PIVOTS_PER_ROW * sum(rows.A.shape)
+        for dust in (active_set.DUST, COARSE):
+            for draw in range(1 + DRAWS):
+                act = equalities.copy()
+                if draw:
+                    _loosened_active_set(rows, norms, act, draw, dust)
+                    budget = POLISH_ROUNDS, 0
+                else:
+                    budget = 0, steps
+                found = self._settle(
+                    levels, rows, norms, act, "one row at a time", failed, *budget, dust
+                )
+                if found is not None:
+                    return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
 
     def _settle(
@@ -117,6 +127,7 @@ class HQP:
         failed: list[str],
         rounds: int,
         pivots: int,
+        dust: float = active_set.DUST,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
         row_norm, frobenius = norms
@@ -130,6 +141,7 @@ class HQP:
             frobenius,
             row_norm,
             -1.0 if self.rank_tolerance is None else left,
+            dust,
             rounds,
             pivots,
         )
@@ -159,16 +171,20 @@ class HQP:
 
 
 def _loosened_active_set(
-    rows: Stacked, norms: tuple[np.ndarray, np.ndarray], act: np.ndarray
-) -> np.ndarray:
-    """The active set of a problem whose bounds are a little apart, each by another amount.
+    rows: Stacked,
+    norms: tuple[np.ndarray, np.ndarray],
+    act: np.ndarray,
+    draw: int,
+    dust: float,
+) -> None:
+    """Set `act` to that of a problem whose bounds are a little apart, each by another amount.
 
     Where many rows meet in one point, moving one row at a time can go in circles; ties broken
     like this, it cannot. What it finds is then settled with the true bounds.
     """
     row_norm, frobenius = norms
     size = np.abs(np.clip(0.0, rows.lower, rows.upper)) + row_norm
-    apart = LOOSEN * size * np.random.default_rng(0).uniform(1.0, 2.0, len(act))
+    apart = LOOSEN * size * np.random.default_rng(draw).uniform(1.0, 2.0, len(act))
     apart[act == 2] = 0.0
     active_set.search(
         rows.A,
@@ -179,10 +195,10 @@ def _loosened_active_set(
         frobenius,
         row_norm,
         -1.0,
+        dust,
         0,
         PIVOTS_PER_ROW * sum(rows.A.shape),
     )
-    return act
 
 
 def _possible(act: np.ndarray, rows: Stacked) -> None:
