@@ -170,9 +170,12 @@ class Trial:
         if self.landing:
             x = _land(robot, data, stack, grasp, x)
         q = grasp.q + x
-        clipped = np.clip(q, robot.q_lower, robot.q_upper)
+        ranges = [v.robot for v in stack.limits if isinstance(v, ConfigurationLimit)]
+        lower = np.max([robot.q_lower, *(r.q_lower for r in ranges)], axis=0)
+        upper = np.min([robot.q_upper, *(r.q_upper for r in ranges)], axis=0)
+        clipped = np.clip(q, lower, upper)
         left = np.abs(clipped - q) > CLIP_TOLERANCE
-        started_inside = (grasp.q >= robot.q_lower) & (grasp.q <= robot.q_upper)
+        started_inside = (grasp.q >= lower) & (grasp.q <= upper)
         if (left & started_inside).any():
             raise AssertionError(f"a step left its range by {np.abs(clipped - q).max()} rad")
         return np.where(left, q, clipped)  # a joint that started outside may still be on its way
