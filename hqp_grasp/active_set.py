@@ -19,12 +19,14 @@ from hqp_grasp.certificate import EPS, VANISHED
 
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
-DUST = 1.0 * EPS  # [–] of a row, for each turn: what is left of it when it has nothing new to say
-OWN = 16.0  # [–] of the rounding of a residual: a push this small is none
+DUST = EPS  # [–] of a row, for each turn: what is left of it when it has nothing new to say
+SMEAR = 4.0 * EPS  # [–] of a row: rounding of its entries after the turns
+LOOSE = 16.0 * EPS  # [–] of the terms that make up a residual: its rounding
 ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
 STILL = 1e-9  # [–] of the way to a level's optimum: a shorter step is no progress
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
 SIGNED = 1e-15  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
+SURE = 1e-2  # [–] of what is doubtful about a multiplier; below it, it counts as none in any case
 
 
 @njit(cache=True, error_model="numpy")
@@ -88,7 +90,8 @@ def spectral_norm(A):
 def _rotate(W, lo, hi, ma, c, r, tol, V):
     """Turn the block L = W[lo:hi, c:c+r] into U Σ, largest first, and the rows below with it.
 
-    Fills V (r, r), the rotation, and returns the number of singular values above tol.
+    Fills V (r, r), the rotation, and returns the number of singular values above tol. Where all
+    are, nothing is turned: triangles keep apart rows of very different size.
     """
     L = W[lo:hi, c : c + r].copy()
     turned = _jacobi(L, r, 1e-3 * tol)
@@ -99,6 +102,7 @@ def _rotate(W, lo, hi, ma, c, r, tol, V):
             s += L[i, j] * L[i, j]
         sigma[j] = np.sqrt(s)
     kept = 0
+    order = np.empty(r, np.int64)
     for j in range(r):
         best = 0
         for l in range(r):
@@ -109,8 +113,12 @@ def _rotate(W, lo, hi, ma, c, r, tol, V):
         sigma[best] = -1.0
         for i in range(r):
             V[i, j] = turned[i, best]
+        order[j] = best
+    if kept == r:
+        return kept
+    for j in range(r):
         for i in range(hi - lo):
-            W[lo + i, c + j] = L[i, best]
+            W[lo + i, c + j] = L[i, order[j]]
     row = np.empty(r)
     for i in range(hi, ma):
         for j in range(r):
@@ -230,13 +238,14 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
                 tol = rough * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
                 V = np.zeros((r, r))
                 r = _rotate(W, lo, hi, ma, c, r, tol, V)
-                turned[k] = True
+                turned[k] = r < made[k]
                 for i in range(made[k]):
                     for j in range(made[k]):
                         turn[k, i, j] = V[i, j]
-                for i in range(lo, hi):
-                    for j in range(c + r, n):
-                        W[i, j] = 0.0
+                if turned[k]:
+                    for i in range(lo, hi):
+                        for j in range(c + r, n):
+                            W[i, j] = 0.0
             # Solve L y = rhs in the least-squares sense.
             rhs = np.empty(m)
             for i in range(m):
@@ -244,7 +253,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
                 for j in range(c):
                     s -= W[lo + i, j] * xq[j]
                 rhs[i] = s
-            if r == m and not ambiguous:
+            if r == m and not turned[k]:
                 for i in range(m):
                     s = rhs[i]
                     for j in range(i):
@@ -300,7 +309,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
             size = abs(target[rows[i]])
             for j in range(c):
                 size += abs(W[i, j] * xq[j])
-            dim[i] = DUST * size
+            dim[i] = LOOSE * size
             missed[k] |= abs(wa[i]) > ROUNDING * size
             clean[i] = wa[i] if abs(wa[i]) > ROUNDING * size else 0.0
     x = xq.copy()
@@ -338,16 +347,30 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
             for j in range(top):
                 g[j] = 0.0
                 h[j] = 0.0
-            for i in range(lo, hi):
-                if wa[i] != 0.0:
-                    lam[rows[i], k] = wa[i]
-                    doubt[rows[i], k] = OWN * dim[i]
-                    size = SIGNED * abs(wa[i]) + dim[i]
-                    rough = 4.0 * DUST * length[i] * abs(wa[i])
-                    for j in range(top):
-                        if W[i, j] != 0.0:
-                            g[j] += W[i, j] * wa[i]
-                            h[j] += abs(W[i, j]) * size + rough
+            # The residuals of the rows that span the level follow from the others', to more
+            # digits than the rows' values have: they balance them.
+            r = 0 if turned[k] else first[k + 1] - top
+            for i in range(hi - 1, lo - 1, -1):
+                push = wa[i]
+                size = SIGNED * abs(push) + dim[i]
+                if i < lo + r:
+                    push = 0.0
+                    size = 0.0
+                    d = top + i - lo
+                    for l in range(i + 1, hi):
+                        if W[l, d] != 0.0:
+                            push -= W[l, d] * lam[rows[l], k]
+                            size += abs(W[l, d]) * doubt[rows[l], k]
+                            size += SMEAR * length[l] * abs(lam[rows[l], k])
+                    push /= W[i, d]
+                    size /= abs(W[i, d])
+                lam[rows[i], k] = push
+                doubt[rows[i], k] = size
+                rough = SMEAR * length[i] * abs(push)
+                for j in range(top):
+                    if W[i, j] != 0.0:
+                        g[j] += W[i, j] * push
+                        h[j] += abs(W[i, j]) * size + rough
         else:
             top = c
             for j in range(c):
@@ -390,7 +413,7 @@ def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
                 s = lam[rows[i], k]
                 if s != 0.0:
                     size = doubt[rows[i], k]
-                    rough = 4.0 * DUST * length[i] * abs(s)
+                    rough = SMEAR * length[i] * abs(s)
                     for j in range(a):
                         if W[i, j] != 0.0:
                             g[j] += W[i, j] * s
@@ -409,17 +432,19 @@ def equalities(lower, upper):
 
 
 @njit(cache=True, error_model="numpy")
-def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
+def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale, caution):
     """Level at which active row i holds x from the wrong side (−1: none), and by how much."""
     if abs(w) > room:
         if w * side > 0.0:
             return -1, 0.0  # the row cannot be met: it is held whatever its sign below
         return k_own, abs(w)
-    if lam[i, k_own] * side > doubt[i, k_own]:
-        return -1, 0.0
+    push = lam[i, k_own] * side
+    if abs(push) > caution * doubt[i, k_own]:
+        return (-1, 0.0) if push > 0.0 else (k_own, -push)
     for k in range(k_own + 1, lam.shape[1]):
         push = lam[i, k] * side * row_norm
-        none = min(scale[k], doubt[i, k] * row_norm)
+        none = doubt[i, k] * row_norm
+        none = caution * max(min(scale[k], none), SURE * none)
         if push > none:
             return -1, 0.0
         if push < -none:
@@ -428,7 +453,9 @@ def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
 
 
 @njit(cache=True, error_model="numpy")
-def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, blocks, pivots):
+def search(
+    A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, caution, blocks, pivots
+):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     First up to `blocks` rounds that take in every violated row and let go every row of wrong sign
@@ -530,7 +557,9 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
             if act[i] == 0 or act[i] == 2 or kept[i]:
                 continue
             room = slack[i] + FEASIBLE * abs(target[i])
-            k, push = _wrong_sign(i, own[i], act[i], w[i], lam, doubt, room, row_norm[i], scale)
+            k, push = _wrong_sign(
+                i, own[i], act[i], w[i], lam, doubt, room, row_norm[i], scale, caution
+            )
             if k < 0:
                 continue
             changed = True

@@ -53,6 +53,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     columns = p + 1 if least_norm else p
     row_norm, frobenius = measure(A, off)
     w = np.empty(M)
+    pull = np.empty(M)  # w as it is: what counts as met may still balance the others
     nearest = np.empty(M)
     natural = 0.0
     length = 0.0
@@ -67,6 +68,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                 s += A[i, j] * x[j]
             nearest[i] = min(max(s, lower[i]), upper[i])
             w[i] = s - nearest[i]
+            pull[i] = w[i]
             asked += nearest[i] * nearest[i]
         if frobenius[k] > 0.0:
             natural = max(natural, np.sqrt(asked) / frobenius[k])
@@ -101,7 +103,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
         scale[:, p] = tol * length
     forces = np.zeros((M, columns))
     for i in range(M):
-        forces[i, own[i]] = w[i]
+        forces[i, own[i]] = pull[i]
         for k in range(own[i] + 1, columns):
             forces[i, k] = lam[i, k]
     imbalance = np.empty((n, columns))
@@ -135,7 +137,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                 terms += abs(A[i, j] * forces[i, k])
             imbalance[j, k] = s
             scale[j, k] += min(scale[j, k], ROUNDING * terms)  # huge multipliers prove nothing
-    return w, push, imbalance, scale
+    return w, pull, push, imbalance, scale
 
 
 def optimality_faults(
@@ -152,13 +154,15 @@ def optimality_faults(
     """Residuals w (M,), and what keeps x from being certified: an empty list where nothing does."""
     if not np.isfinite(x).all():
         return np.full(len(A), np.nan), ["x is not finite"]
-    w, push, imbalance, scale = check(A, lower, upper, off, x, multipliers, tol, left, least_norm)
+    w, miss, push, imbalance, scale = check(
+        A, lower, upper, off, x, multipliers, tol, left, least_norm
+    )
     faults = []
     for k in np.flatnonzero(~(np.abs(imbalance) <= scale).all(axis=0)):
         last = k == len(off) - 1
         above = slice(0, off[k])
         own = slice(off[k], off[k + 1]) if not last else slice(0, 0)
-        pull = x if last else A[own].T @ w[own]
+        pull = x if last else A[own].T @ miss[own]
         rest = _least_imbalance(pull, A[above], push[above], scale[:, k])
         if not rest <= 1.0:
             name = "least norm of x" if last else f"level {k}"

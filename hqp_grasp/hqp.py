@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import daqp
 import numpy as np
@@ -28,6 +29,7 @@ QUICK_PIVOTS = 60  # and steps of that before the backend is asked
 POLISH_ROUNDS = 20  # rounds allowed to settle the active set that a backend names
 PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
 DRAWS = 2  # times that bounds are drawn apart
+CAUTION = (1.0, 1e3, 1e-3)  # times the rounding of a multiplier that is not trusted to be its sign
 COARSE = 1e-13  # [–] of a row: at last, rows dependent to this are taken as dependent
 LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
 BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
@@ -102,19 +104,18 @@ class HQP:
             if found is not None:
                 return found
         steps = PIVOTS_PER_ROW * sum(rows.A.shape)
-        for dust in (active_set.DUST, COARSE):
-            for draw in range(1 + DRAWS):
-                act = equalities.copy()
-                if draw:
-                    _loosened_active_set(rows, norms, act, draw, dust)
-                    budget = POLISH_ROUNDS, 0
-                else:
-                    budget = 0, steps
-                found = self._settle(
-                    levels, rows, norms, act, "one row at a time", failed, *budget, dust
-                )
-                if found is not None:
-                    return found
+        for dust, caution, draw in product((active_set.DUST, COARSE), CAUTION, range(1 + DRAWS)):
+            act = equalities.copy()
+            if draw:
+                _loosened_active_set(rows, norms, act, draw, dust, caution)
+                budget = POLISH_ROUNDS, 0
+            else:
+                budget = 0, steps
+            found = self._settle(
+                levels, rows, norms, act, "one row at a time", failed, *budget, dust, caution
+            )
+            if found is not None:
+                return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
 
     def _settle(
@@ -128,6 +129,7 @@ class HQP:
         rounds: int,
         pivots: int,
         dust: float = active_set.DUST,
+        caution: float = 1.0,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
         row_norm, frobenius = norms
@@ -142,6 +144,7 @@ class HQP:
             row_norm,
             -1.0 if self.rank_tolerance is None else left,
             dust,
+            caution,
             rounds,
             pivots,
         )
@@ -176,6 +179,7 @@ def _loosened_active_set(
     act: np.ndarray,
     draw: int,
     dust: float,
+    caution: float,
 ) -> None:
     """Set `act` to that of a problem whose bounds are a little apart, each by another amount.
 
@@ -196,6 +200,7 @@ def _loosened_active_set(
         row_norm,
         -1.0,
         dust,
+        caution,
         0,
         PIVOTS_PER_ROW * sum(rows.A.shape),
     )
