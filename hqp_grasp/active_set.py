@@ -135,9 +135,12 @@ def _rotate(W, lo, hi, ma, c, r, tol, V):
 def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
     """Lexicographic least squares of the rows with act ≠ 0, as equalities at `target`.
 
-    Returns x (n,), w (M,) the residuals of the active rows, lam (M, p + 1) and rank (p,).
+    Returns x (n,), w (M,) the residuals of the active rows, lam and doubt (M, p + 1), rank (p,).
     Column k of lam holds the multipliers of the rows above for level k's optimality,
-    A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_{jk} = 0, and column p those of the minimum norm of x.
+    A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_{jk} = 0, and column p those of the minimum norm of x; rows of
+    level k hold w_k there, with more digits than w has. `doubt`, of the same shape, is how much
+    of lam may be rounding. What is left of a row, after it is reduced by c others, counts as
+    nothing below `dust` × c of its length.
     `frobenius` (p,) holds ‖A_k‖_F of the whole levels; rank_tolerance < 0 asks for the default.
     """
     M, n = A.shape
@@ -432,19 +435,19 @@ def equalities(lower, upper):
 
 
 @njit(cache=True, error_model="numpy")
-def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale, caution):
+def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
     """Level at which active row i holds x from the wrong side (−1: none), and by how much."""
     if abs(w) > room:
         if w * side > 0.0:
             return -1, 0.0  # the row cannot be met: it is held whatever its sign below
         return k_own, abs(w)
     push = lam[i, k_own] * side
-    if abs(push) > caution * doubt[i, k_own]:
+    if abs(push) > doubt[i, k_own]:
         return (-1, 0.0) if push > 0.0 else (k_own, -push)
     for k in range(k_own + 1, lam.shape[1]):
         push = lam[i, k] * side * row_norm
         none = doubt[i, k] * row_norm
-        none = caution * max(min(scale[k], none), SURE * none)
+        none = max(min(scale[k], none), SURE * none)
         if push > none:
             return -1, 0.0
         if push < -none:
@@ -453,9 +456,7 @@ def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale, caution):
 
 
 @njit(cache=True, error_model="numpy")
-def search(
-    A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, caution, blocks, pivots
-):
+def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     First up to `blocks` rounds that take in every violated row and let go every row of wrong sign
@@ -557,9 +558,7 @@ def search(
             if act[i] == 0 or act[i] == 2 or kept[i]:
                 continue
             room = slack[i] + FEASIBLE * abs(target[i])
-            k, push = _wrong_sign(
-                i, own[i], act[i], w[i], lam, doubt, room, row_norm[i], scale, caution
-            )
+            k, push = _wrong_sign(i, own[i], act[i], w[i], lam, doubt, room, row_norm[i], scale)
             if k < 0:
                 continue
             changed = True

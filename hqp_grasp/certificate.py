@@ -44,7 +44,8 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
 
     `left`: rank tolerance; a level may leave that part of its residual. With least_norm, column
     p must prove that x is the shortest optimum. Returns w (M,) with residuals of the size of
-    rounding set to 0, push (M,) 0 where a row may not push, 1 upwards, −1 downwards, 2 both,
+    rounding set to 0, pull (M,) the residuals as they are, since a small one of a large row may
+    balance the others, push (M,) 0 where a row may not push, 1 upwards, −1 downwards, 2 both,
     imbalance (n, columns) and scale (n, columns): what is left of each level's pull on each
     unknown, and how much of that counts as none: what its own rows' rooms would make up for.
     """

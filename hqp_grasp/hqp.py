@@ -12,7 +12,7 @@ import proxsuite
 import qpsolvers
 from scipy.sparse import csc_matrix
 
-from hqp_grasp import active_set
+from hqp_grasp import active_set, many_digits
 from hqp_grasp.certificate import measure, optimality_faults
 from hqp_grasp.errors import InputError, SolverError, one_of
 from hqp_grasp.level import (
@@ -29,7 +29,6 @@ QUICK_PIVOTS = 60  # and steps of that before the backend is asked
 POLISH_ROUNDS = 20  # rounds allowed to settle the active set that a backend names
 PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
 DRAWS = 2  # times that bounds are drawn apart
-CAUTION = (1.0, 1e3, 1e-3)  # times the rounding of a multiplier that is not trusted to be its sign
 COARSE = 1e-13  # [–] of a row: at last, rows dependent to this are taken as dependent
 LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
 BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
@@ -56,11 +55,18 @@ def solvers() -> tuple[str, ...]:
 class HQP:
     """Strict lexicographic least squares: each level as nearly as those above allow.
 
-    An answer is found by the first of these ways that passes the optimality certificate: the
-    equalities alone or the warm start's active set, settled by a few rounds of exact active-set
-    steps (`shortcuts`); the QP solver, level by level in the freedom left, its active set
-    settled likewise; the exact one-row-at-a-time method. Solution.method names the way,
-    Solution.failed the ways before it. Where several x are optimal the shortest is returned.
+    An answer is found by the first of these ways that passes the optimality certificate:
+
+    - "shortcut": the equalities alone or the warm start's active set, settled by a few rounds of
+      exact active-set steps (left out where `shortcuts` is False);
+    - the QP solver, level by level in the freedom left, its active set settled likewise;
+    - "one row at a time": the exact primal method, then with bounds drawn apart, then with rows
+      that are dependent to 1e-13 taken as dependent;
+    - "many digits": the same method in decimal arithmetic, for levels whose rows differ in size by
+      1e10 or more. It takes seconds; some three in 100,000 problems of benchmarks/fuzz.py need it.
+
+    Solution.method names the way, Solution.failed the ways before it. Where several x are optimal
+    the shortest is returned.
     """
 
     solver: str = "proxqp"  # one of solvers()
@@ -104,16 +110,23 @@ class HQP:
             if found is not None:
                 return found
         steps = PIVOTS_PER_ROW * sum(rows.A.shape)
-        for dust, caution, draw in product((active_set.DUST, COARSE), CAUTION, range(1 + DRAWS)):
+        for dust, draw in product((active_set.DUST, COARSE), range(1 + DRAWS)):
             act = equalities.copy()
             if draw:
-                _loosened_active_set(rows, norms, act, draw, dust, caution)
-                budget = POLISH_ROUNDS, 0
-            else:
-                budget = 0, steps
+                _loosened_active_set(rows, norms, act, draw, dust)
+            budget = (POLISH_ROUNDS, 0) if draw else (0, steps)
             found = self._settle(
-                levels, rows, norms, act, "one row at a time", failed, *budget, dust, caution
+                levels, rows, norms, act, "one row at a time", failed, *budget, dust
             )
+            if found is not None:
+                return found
+        act = equalities.copy()
+        try:
+            answer = many_digits.search(rows.A, rows.lower, rows.upper, rows.offsets, act, steps)
+        except ArithmeticError as error:
+            failed.append(f"many digits: {error!r}")
+        else:
+            found = self._certified(levels, rows, act, *answer, "many digits", failed)
             if found is not None:
                 return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
@@ -129,11 +142,9 @@ class HQP:
         rounds: int,
         pivots: int,
         dust: float = active_set.DUST,
-        caution: float = 1.0,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
         row_norm, frobenius = norms
-        left = self.rank_tolerance or 0.0
         x, multipliers, rank = active_set.search(
             rows.A,
             rows.lower,
@@ -142,12 +153,26 @@ class HQP:
             act,
             frobenius,
             row_norm,
-            -1.0 if self.rank_tolerance is None else left,
+            -1.0 if self.rank_tolerance is None else self.rank_tolerance,
             dust,
-            caution,
             rounds,
             pivots,
         )
+        return self._certified(levels, rows, act, x, multipliers, rank, method, failed)
+
+    def _certified(
+        self,
+        levels: Sequence[Level],
+        rows: Stacked,
+        act: np.ndarray,
+        x: np.ndarray,
+        multipliers: np.ndarray,
+        rank: np.ndarray,
+        method: str,
+        failed: list[str],
+    ) -> Solution | None:
+        """The answer, where it passes its certificate; None, with the reason in `failed`."""
+        left = self.rank_tolerance or 0.0
         residual, faults = optimality_faults(
             rows.A,
             rows.lower,
@@ -179,7 +204,6 @@ def _loosened_active_set(
     act: np.ndarray,
     draw: int,
     dust: float,
-    caution: float,
 ) -> None:
     """Set `act` to that of a problem whose bounds are a little apart, each by another amount.
 
@@ -200,7 +224,6 @@ def _loosened_active_set(
         row_norm,
         -1.0,
         dust,
-        caution,
         0,
         PIVOTS_PER_ROW * sum(rows.A.shape),
     )
