@@ -63,7 +63,7 @@ class HQP:
     - "one row at a time": the exact primal method, then with bounds drawn apart, then with rows
       that are dependent to 1e-13 taken as dependent;
     - "many digits": the same method in decimal arithmetic, for levels whose rows differ in size by
-      1e10 or more. It takes seconds; some three in 100,000 problems of benchmarks/fuzz.py need it.
+      1e10 or more. It takes seconds; some ten in 100,000 problems of benchmarks/fuzz.py need it.
 
     Solution.method names the way, Solution.failed the ways before it. Where several x are optimal
     the shortest is returned.

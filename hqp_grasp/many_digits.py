@@ -3,7 +3,7 @@
 Rows of one level whose sizes differ by ten orders of magnitude or more leave residuals whose
 rounding hides the forces of the small rows; no tolerance tells their signs. The same method as in
 `active_set`, with enough digits, needs none. It is slow, seconds for the largest problems, and
-asked last: some three in 100,000 problems of `benchmarks/fuzz.py` get here.
+asked last: some ten in 100,000 problems of `benchmarks/fuzz.py` get here.
 """
 
 from __future__ import annotations
