@@ -6,11 +6,17 @@ all levels are stacked; `act` says how each takes part: 2 equality, +1 held at i
 
 Each level is reduced in the freedom left by those above: rows are picked by the largest remaining
 norm and turned by Householder reflections from the right (Golub & Van Loan, ch. 5), so that
-A_k Q = [… L_k 0] with L_k (m, r). Where a pivot comes close to the rank tolerance, a one-sided
-Jacobi SVD of L_k decides the rank on singular values, as the convention asks.
+A_k Q = [… L_k 0] with L_k (m, r). A row with one entry left, such as a bound of one unknown, needs
+no reflection: its column changes place. Where a pivot comes close to the rank tolerance, a
+one-sided Jacobi SVD of L_k decides the rank on singular values, as the convention asks.
+
+`search` allocates one Work and fills it anew in every step: `_reduce` finds x, `_weigh` the
+residuals, and `_column` the multipliers of one level, which only points worth judging need.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -26,7 +32,22 @@ ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it cou
 STILL = 1e-9  # [–] of the way to a level's optimum: a shorter step is no progress
 FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
 SIGNED = 1e-15  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
-SURE = 1e-2  # [–] of what is doubtful about a multiplier; below it, it counts as none in any case
+SURE = 1e-1  # [–] of what is doubtful about a multiplier; below it, it counts as none in any case
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc"})
+def _dot(a, b):
+    s = 0.0
+    for j in range(len(a)):
+        s += a[j] * b[j]
+    return s
+
+
+@njit(cache=True, error_model="numpy")
+def _subtract(a, s, b):
+    """a −= s b"""
+    for j in range(len(a)):
+        a[j] -= s * b[j]
 
 
 @njit(cache=True, error_model="numpy")
@@ -131,297 +152,373 @@ def _rotate(W, lo, hi, ma, c, r, tol, V):
     return kept
 
 
-@njit(cache=True, error_model="numpy")
-def solve_active(A, target, off, act, frobenius, rank_tolerance, dust):
-    """Lexicographic least squares of the rows with act ≠ 0, as equalities at `target`.
+class Work(NamedTuple):
+    """The active rows, level by level, and their factors; refilled for each active set.
 
-    Returns x (n,), w (M,) the residuals of the active rows, lam and doubt (M, p + 1), rank (p,).
-    Column k of lam holds the multipliers of the rows above for level k's optimality,
-    A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_{jk} = 0, and column p those of the minimum norm of x; rows of
-    level k hold w_k there, with more digits than w has. `doubt`, of the same shape, is how much
-    of lam may be rounding. What is left of a row, after it is reduced by c others, counts as
-    nothing below `dust` × c of its length.
-    `frobenius` (p,) holds ‖A_k‖_F of the whole levels; rank_tolerance < 0 asks for the default.
+    The rows in use stand first, ma of them; n unknowns, p levels.
     """
-    M, n = A.shape
+
+    rows: np.ndarray  # (M,) which rows are active, in the order they were picked,
+    start: np.ndarray  # (p + 1,) and where each level's begin
+    first: np.ndarray  # (p + 1,) level k owns coordinates first[k]:first[k+1] of xq
+    made: np.ndarray  # (p,) pivots of each level; more than it owns where its rank was cut
+    triangular: np.ndarray  # (p,) whether L_k is square, and so needs no orthogonal factor
+    turned: np.ndarray  # (p,) whether a rotation cut its rank
+    turn: np.ndarray  # (p, n, n) which
+    W: np.ndarray  # (M, n) the rows, turned: A Q
+    length: np.ndarray  # (M,) their norms
+    left: np.ndarray  # (M,) the squared norms of what is left of the rows of the level at hand
+    H: np.ndarray  # (M, n) the reflector made from each picked row,
+    beta: np.ndarray  # (M,) its factor, 0 where the row only moved a column
+    column: np.ndarray  # (M,) from here
+    T: np.ndarray  # (M, n) thin orthogonal factors of the L_k that are not triangular
+    R: np.ndarray  # (n, n) and their triangular ones
+    xq: np.ndarray  # (n,) Qᵀ x
+    rhs: np.ndarray  # (M,)
+    wa: np.ndarray  # (M,) residuals,
+    dim: np.ndarray  # (M,) and how much of that may be rounding
+    missed: np.ndarray  # (p,) levels with a residual that is not
+    g: np.ndarray  # (n,) a level's pull on the coordinates above it
+    h: np.ndarray  # (n,) and what is doubtful of that
+    y: np.ndarray  # (n,)
+    z: np.ndarray  # (n,)
+
+
+@njit(cache=True, error_model="numpy")
+def _work(M, n, p):
+    return Work(
+        np.empty(M, np.int64),
+        np.empty(p + 1, np.int64),
+        np.zeros(p + 1, np.int64),
+        np.empty(p, np.int64),
+        np.empty(p, np.bool_),
+        np.empty(p, np.bool_),
+        np.empty((p, n, n)),
+        np.empty((M, n)),
+        np.empty(M),
+        np.empty(M),
+        np.empty((M, n)),
+        np.empty(M),
+        np.empty(M, np.int64),
+        np.empty((M, n)),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty(M),
+        np.empty(M),
+        np.empty(M),
+        np.empty(p, np.bool_),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _pick(work, lo, hi, ma, c, steps, gone, rough):
+    """Pick rows lo:hi by the largest rest, and turn all rows so that coordinate c + r is theirs.
+
+    Returns how many were picked, and whether some came close to the rank tolerance `rough`.
+    """
+    W, H, left, length = work.W, work.H, work.left, work.length
+    n = W.shape[1]
+    for i in range(lo, hi):
+        left[i] = _dot(W[i, c:], W[i, c:])
+    ambiguous = False
+    r = 0
+    while r < steps:
+        d = c + r
+        row = lo + r
+        best = 0.0
+        pick = row
+        for i in range(row, hi):
+            tiny = gone * d * length[i]
+            if left[i] <= tiny * tiny:
+                if left[i] > 0.0:
+                    for j in range(d, n):
+                        W[i, j] = 0.0
+                    left[i] = 0.0
+            elif left[i] > best:
+                best = left[i]
+                pick = i
+        norm = np.sqrt(best)
+        if best == 0.0 or norm <= rough / (CLEAR * 10.0):
+            break
+        if norm <= rough * CLEAR:
+            ambiguous = True
+        if pick != row:
+            work.rows[pick], work.rows[row] = work.rows[row], work.rows[pick]
+            for j in range(n):
+                W[pick, j], W[row, j] = W[row, j], W[pick, j]
+            length[pick], length[row] = length[row], length[pick]
+            left[pick] = left[row]
+        entries = 0
+        only = d
+        for j in range(d, n):
+            if W[row, j] != 0.0:
+                entries += 1
+                only = j
+                if entries > 1:
+                    break
+        if entries == 1:
+            work.beta[row] = 0.0
+            work.column[row] = only
+            for i in range(row, ma):
+                moved = W[i, only]
+                W[i, only] = W[i, d]
+                W[i, d] = moved
+                if i < hi and moved != 0.0:
+                    left[i] = _dot(W[i, d + 1 :], W[i, d + 1 :])
+        else:
+            alpha = -norm if W[row, d] > 0.0 else norm
+            for j in range(d, n):
+                H[row, j] = W[row, j]
+            H[row, d] -= alpha
+            beta = 1.0 / (norm * abs(H[row, d]))
+            work.beta[row] = beta
+            W[row, d] = alpha
+            for j in range(d + 1, n):
+                W[row, j] = 0.0
+            for i in range(row + 1, ma):
+                s = _dot(W[i, d:], H[row, d:])
+                if s != 0.0:
+                    _subtract(W[i, d:], s * beta, H[row, d:])
+                if i < hi:
+                    left[i] = _dot(W[i, d + 1 :], W[i, d + 1 :])
+        r += 1
+    return r, ambiguous
+
+
+@njit(cache=True, error_model="numpy")
+def _least_squares(work, lo, hi, c, r):
+    """Solve L y = rhs for coordinates c:c+r, in the least-squares sense; the rest stays in rhs."""
+    W, T, R, rhs, y = work.W, work.T, work.R, work.rhs, work.y
+    for j in range(r):  # Gram–Schmidt, twice is enough
+        for i in range(lo, hi):
+            T[i, c + j] = W[i, c + j]
+        for l in range(j):
+            R[c + l, c + j] = 0.0
+        for _ in range(2):
+            for l in range(j):
+                s = 0.0
+                for i in range(lo, hi):
+                    s += T[i, c + l] * T[i, c + j]
+                R[c + l, c + j] += s
+                for i in range(lo, hi):
+                    T[i, c + j] -= s * T[i, c + l]
+        s = 0.0
+        for i in range(lo, hi):
+            s += T[i, c + j] * T[i, c + j]
+        s = np.sqrt(s)
+        R[c + j, c + j] = s
+        for i in range(lo, hi):
+            T[i, c + j] /= s
+        work.xq[c + j] = 0.0
+    for _ in range(2):  # the second pass removes what rounding left
+        for j in range(r):
+            s = 0.0
+            for i in range(lo, hi):
+                s += T[i, c + j] * rhs[i]
+            y[j] = s
+            for i in range(lo, hi):
+                rhs[i] -= s * T[i, c + j]
+        for j in range(r - 1, -1, -1):
+            s = y[j]
+            for l in range(j + 1, r):
+                s -= R[c + j, c + l] * y[l]
+            y[j] = s / R[c + j, c + j]
+            work.xq[c + j] += y[j]
+
+
+@njit(cache=True, error_model="numpy")
+def _reduce(A, target, off, act, row_norm, frobenius, rough, dust, work, x):
+    """Lexicographic least squares of the rows with act ≠ 0, as equalities at `target`: x.
+
+    What is left of a row, after it is reduced by c others, counts as nothing below `dust` × c of
+    its length; singular values, below `rough` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
+    """
+    n = A.shape[1]
     p = len(off) - 1
-    rows = np.empty(M, np.int64)
-    start = np.empty(p + 1, np.int64)
-    demanding = np.zeros(p, np.bool_)  # levels with equalities
+    W, xq, rows, rhs = work.W, work.xq, work.rows, work.rhs
     ma = 0
     for k in range(p):
-        start[k] = ma
+        work.start[k] = ma
         for i in range(off[k], off[k + 1]):
-            demanding[k] |= act[i] == 2
             if act[i] != 0:
                 rows[ma] = i
+                for j in range(n):
+                    W[ma, j] = A[i, j]
+                work.length[ma] = row_norm[i]
                 ma += 1
-    start[p] = ma
-    W = np.empty((ma, n))
-    length = np.empty(ma)
-    for i in range(ma):
-        s = 0.0
-        for j in range(n):
-            W[i, j] = A[rows[i], j]
-            s += W[i, j] * W[i, j]
-        length[i] = np.sqrt(s)
-    H = np.empty((ma, n))  # the reflector made from each picked row,
-    beta = np.empty(ma)
-    made = np.zeros(p, np.int64)  # and how many each level made
-    xq = np.zeros(n)
-    wa = np.zeros(ma)
-    clean = np.zeros(ma)  # the same, without what is rounding
-    dim = np.zeros(ma)  # how much of wa may be rounding
-    missed = np.zeros(p, np.bool_)  # levels with a residual that is not
-    first = np.zeros(p + 1, np.int64)  # level k owns coordinates first[k]:first[k+1]
-    triangular = np.ones(p, np.bool_)
-    T = np.zeros((ma, n))  # thin orthogonal factors of the L_k that are not triangular
-    R = np.zeros((n, n))  # and their triangular ones
-    turn = np.empty((p, n, n))  # the rotations of levels close to losing rank
-    turned = np.zeros(p, np.bool_)
+    work.start[p] = ma
     c = 0
     for k in range(p):
-        first[k] = c
-        lo, hi = start[k], start[k + 1]
+        work.first[k] = c
+        lo, hi = work.start[k], work.start[k + 1]
         m = hi - lo
-        steps = min(m, n - c)
-        if steps > 0 and frobenius[k] > 0.0:
-            size = max(off[k + 1] - off[k], n)
-            if rank_tolerance < 0.0 or not demanding[k]:  # a limit is never truncated
-                rough = size * EPS * frobenius[k]
-            else:
-                rough = rank_tolerance * frobenius[k]
-            r = 0
-            ambiguous = False
-            while r < steps:
-                best = 0.0
-                pick = lo + r
-                for i in range(lo + r, hi):
-                    s = 0.0
-                    for j in range(c + r, n):
-                        s += W[i, j] * W[i, j]
-                    gone = dust * (c + r) * length[i]
-                    if s <= gone * gone:
-                        for j in range(c + r, n):
-                            W[i, j] = 0.0
-                        continue
-                    if s > best:
-                        best = s
-                        pick = i
-                norm = np.sqrt(best)
-                if best == 0.0 or norm <= rough / (CLEAR * 10.0):
-                    break
-                if norm <= rough * CLEAR:
-                    ambiguous = True
-                if pick != lo + r:
-                    rows[pick], rows[lo + r] = rows[lo + r], rows[pick]
-                    for j in range(n):
-                        W[pick, j], W[lo + r, j] = W[lo + r, j], W[pick, j]
-                    length[pick], length[lo + r] = length[lo + r], length[pick]
-                d = c + r
-                row = lo + r
-                alpha = -norm if W[row, d] > 0.0 else norm
-                for j in range(d, n):
-                    H[row, j] = W[row, j]
-                H[row, d] -= alpha
-                beta[row] = 1.0 / (norm * abs(H[row, d]))
-                for i in range(row + 1, ma):
-                    s = 0.0
-                    for j in range(d, n):
-                        s += W[i, j] * H[row, j]
-                    s *= beta[row]
-                    for j in range(d, n):
-                        W[i, j] -= s * H[row, j]
-                W[row, d] = alpha
-                for j in range(d + 1, n):
-                    W[row, j] = 0.0
-                r += 1
-            made[k] = r
+        r = 0
+        work.made[k] = 0
+        work.turned[k] = False
+        if m > 0 and c < n and frobenius[k] > 0.0:
+            r, ambiguous = _pick(work, lo, hi, ma, c, min(m, n - c), dust, rough[k])
+            work.made[k] = r
             if ambiguous:
-                tol = rough * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
+                tol = rough[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
                 V = np.zeros((r, r))
                 r = _rotate(W, lo, hi, ma, c, r, tol, V)
-                turned[k] = r < made[k]
-                for i in range(made[k]):
-                    for j in range(made[k]):
-                        turn[k, i, j] = V[i, j]
-                if turned[k]:
+                work.turned[k] = r < work.made[k]
+                for i in range(work.made[k]):
+                    for j in range(work.made[k]):
+                        work.turn[k, i, j] = V[i, j]
+                if work.turned[k]:
                     for i in range(lo, hi):
                         for j in range(c + r, n):
                             W[i, j] = 0.0
-            # Solve L y = rhs in the least-squares sense.
-            rhs = np.empty(m)
+        for i in range(lo, hi):
+            rhs[i] = target[rows[i]] - _dot(W[i, :c], xq)
+        work.triangular[k] = r == m and not work.turned[k]
+        if work.triangular[k]:
             for i in range(m):
-                s = target[rows[lo + i]]
-                for j in range(c):
-                    s -= W[lo + i, j] * xq[j]
-                rhs[i] = s
-            if r == m and not turned[k]:
-                for i in range(m):
-                    s = rhs[i]
-                    for j in range(i):
-                        s -= W[lo + i, c + j] * xq[c + j]
-                    xq[c + i] = s / W[lo + i, c + i]
-            else:
-                triangular[k] = False
-                for j in range(r):  # Gram–Schmidt, twice is enough
-                    for i in range(m):
-                        T[lo + i, c + j] = W[lo + i, c + j]
-                    for _ in range(2):
-                        for l in range(j):
-                            s = 0.0
-                            for i in range(lo, hi):
-                                s += T[i, c + l] * T[i, c + j]
-                            R[c + l, c + j] += s
-                            for i in range(lo, hi):
-                                T[i, c + j] -= s * T[i, c + l]
-                    s = 0.0
-                    for i in range(lo, hi):
-                        s += T[i, c + j] * T[i, c + j]
-                    s = np.sqrt(s)
-                    R[c + j, c + j] = s
-                    for i in range(lo, hi):
-                        T[i, c + j] /= s
-                y = np.empty(r)
-                for _ in range(2):  # the second pass removes what rounding left
-                    for j in range(r):
-                        s = 0.0
-                        for i in range(m):
-                            s += T[lo + i, c + j] * rhs[i]
-                        y[j] = s
-                        for i in range(m):
-                            rhs[i] -= s * T[lo + i, c + j]
-                    for j in range(r - 1, -1, -1):
-                        s = y[j]
-                        for l in range(j + 1, r):
-                            s -= R[c + j, c + l] * y[l]
-                        y[j] = s / R[c + j, c + j]
-                        xq[c + j] += y[j]
-                for i in range(m):
-                    wa[lo + i] = -rhs[i]
-            c += r
+                s = rhs[lo + i] - _dot(W[lo + i, c : c + i], xq[c:])
+                xq[c + i] = s / W[lo + i, c + i]
+                rhs[lo + i] = 0.0
         else:
-            for i in range(lo, hi):
-                s = target[rows[i]]
-                for j in range(c):
-                    s -= W[i, j] * xq[j]
-                wa[i] = -s
-            triangular[k] = m == 0
-        first[k + 1] = c
-        for i in range(lo, hi):  # a residual of the size of rounding is none
-            size = abs(target[rows[i]])
-            for j in range(c):
-                size += abs(W[i, j] * xq[j])
-            dim[i] = LOOSE * size
-            missed[k] |= abs(wa[i]) > ROUNDING * size
-            clean[i] = wa[i] if abs(wa[i]) > ROUNDING * size else 0.0
-    x = xq.copy()
+            _least_squares(work, lo, hi, c, r)
+        for i in range(lo, hi):
+            work.wa[i] = -rhs[i]
+        c += r
+    work.first[p] = c
+    for j in range(n):
+        x[j] = xq[j] if j < c else 0.0
     for k in range(p - 1, -1, -1):  # x = Q xq, the factors of Q from the last to the first
-        a, r = first[k], made[k]
-        if turned[k]:
-            part = x[a : a + r].copy()
+        a, r = work.first[k], work.made[k]
+        if work.turned[k]:
             for i in range(r):
                 s = 0.0
                 for j in range(r):
-                    s += turn[k, i, j] * part[j]
-                x[a + i] = s
+                    s += work.turn[k, i, j] * x[a + j]
+                work.y[i] = s
+            for i in range(r):
+                x[a + i] = work.y[i]
         for l in range(r - 1, -1, -1):
-            row = start[k] + l
-            s = 0.0
-            for j in range(a + l, n):
-                s += H[row, j] * x[j]
-            s *= beta[row]
-            for j in range(a + l, n):
-                x[j] -= s * H[row, j]
-    w = np.zeros(M)
-    for i in range(ma):
-        w[rows[i]] = clean[i]
-    rank = first[1:] - first[:-1]
-    lam = np.zeros((M, p + 1))
-    doubt = np.zeros((M, p + 1))
-    g = np.empty(n)
-    h = np.empty(n)  # what is doubtful of g
-    for k in range(p + 1):
-        if k < p:
-            lo, hi = start[k], start[k + 1]
-            top = first[k]
-            if not missed[k]:
+            row = work.start[k] + l
+            d = a + l
+            if work.beta[row] == 0.0:
+                only = work.column[row]
+                x[d], x[only] = x[only], x[d]
                 continue
+            s = work.beta[row] * _dot(work.H[row, d:], x[d:])
+            _subtract(x[d:], s, work.H[row, d:])
+
+
+@njit(cache=True, error_model="numpy")
+def _weigh(target, work, w):
+    """w (M,), the residuals of the active rows: those of the size of rounding are none."""
+    p = len(work.made)
+    w[:] = 0.0
+    for k in range(p):
+        work.missed[k] = False
+        for i in range(work.start[k], work.start[k + 1]):
+            size = abs(target[work.rows[i]])
+            for j in range(work.first[k + 1]):
+                size += abs(work.W[i, j] * work.xq[j])
+            work.dim[i] = LOOSE * size
+            if abs(work.wa[i]) > ROUNDING * size:
+                work.missed[k] = True
+                w[work.rows[i]] = work.wa[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _column(k, work, lam, doubt):
+    """Column k of lam (M, p + 1), the multipliers of the rows above for level k's optimality.
+
+    A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; column p has those of the minimum norm of x. Rows of level
+    k hold w_k there, with more digits than w has. `doubt`, of the same shape, is how much of lam
+    may be rounding.
+    """
+    W, T, R, rows, start, first = work.W, work.T, work.R, work.rows, work.start, work.first
+    g, h, y, z = work.g, work.h, work.y, work.z
+    length = work.length
+    p = len(work.made)
+    for i in range(len(lam)):
+        lam[i, k] = 0.0
+        doubt[i, k] = 0.0
+    top = first[k]
+    if k == p:
+        for j in range(top):
+            g[j] = work.xq[j]
+            h[j] = SIGNED * abs(work.xq[j])
+    elif not work.missed[k]:
+        return
+    else:
+        lo, hi = start[k], start[k + 1]
+        for j in range(top):
+            g[j] = 0.0
+            h[j] = 0.0
+        # The residuals of the rows that span the level follow from the others', to more digits
+        # than the rows' values have: they balance them.
+        r = 0 if work.turned[k] else first[k + 1] - top
+        for i in range(hi - 1, lo - 1, -1):
+            push = work.wa[i]
+            size = SIGNED * abs(push) + work.dim[i]
+            if i < lo + r:
+                push = 0.0
+                size = 0.0
+                d = top + i - lo
+                for l in range(i + 1, hi):
+                    if W[l, d] != 0.0:
+                        push -= W[l, d] * lam[rows[l], k]
+                        size += abs(W[l, d]) * doubt[rows[l], k]
+                        size += SMEAR * length[l] * abs(lam[rows[l], k])
+                push /= W[i, d]
+                size /= abs(W[i, d])
+            lam[rows[i], k] = push
+            doubt[rows[i], k] = size
+            rounding = SMEAR * length[i] * abs(push)
             for j in range(top):
-                g[j] = 0.0
-                h[j] = 0.0
-            # The residuals of the rows that span the level follow from the others', to more
-            # digits than the rows' values have: they balance them.
-            r = 0 if turned[k] else first[k + 1] - top
-            for i in range(hi - 1, lo - 1, -1):
-                push = wa[i]
-                size = SIGNED * abs(push) + dim[i]
-                if i < lo + r:
-                    push = 0.0
-                    size = 0.0
-                    d = top + i - lo
-                    for l in range(i + 1, hi):
-                        if W[l, d] != 0.0:
-                            push -= W[l, d] * lam[rows[l], k]
-                            size += abs(W[l, d]) * doubt[rows[l], k]
-                            size += SMEAR * length[l] * abs(lam[rows[l], k])
-                    push /= W[i, d]
-                    size /= abs(W[i, d])
-                lam[rows[i], k] = push
-                doubt[rows[i], k] = size
-                rough = SMEAR * length[i] * abs(push)
-                for j in range(top):
-                    if W[i, j] != 0.0:
-                        g[j] += W[i, j] * push
-                        h[j] += abs(W[i, j]) * size + rough
-        else:
-            top = c
-            for j in range(c):
-                g[j] = xq[j]
-                h[j] = SIGNED * abs(xq[j])
-        for l in range(min(k, p) - 1, -1, -1):
-            lo, hi = start[l], start[l + 1]
-            a, r = first[l], first[l + 1] - first[l]
-            if r == 0:
-                continue
-            if triangular[l]:  # Lᵀ λ = −g
-                for i in range(r - 1, -1, -1):
-                    s = -g[a + i]
-                    size = h[a + i]
-                    for j in range(i + 1, r):
-                        s -= W[lo + j, a + i] * lam[rows[lo + j], k]
-                        size += abs(W[lo + j, a + i]) * doubt[rows[lo + j], k]
-                    lam[rows[lo + i], k] = s / W[lo + i, a + i]
-                    doubt[rows[lo + i], k] = size / abs(W[lo + i, a + i])
-            else:  # λ = −T R⁻ᵀ g, the least-norm one
-                z = np.empty(r)
-                y = np.empty(r)
-                for i in range(r):
-                    s = -g[a + i]
-                    size = h[a + i]
-                    for j in range(i):
-                        s -= R[a + j, a + i] * z[j]
-                        size += abs(R[a + j, a + i]) * y[j]
-                    z[i] = s / R[a + i, a + i]
-                    y[i] = size / R[a + i, a + i]
-                for i in range(lo, hi):
-                    s = 0.0
-                    size = 0.0
-                    for j in range(r):
-                        s += T[i, a + j] * z[j]
-                        size += abs(T[i, a + j]) * y[j]
-                    lam[rows[i], k] = s
-                    doubt[rows[i], k] = size
+                if W[i, j] != 0.0:
+                    g[j] += W[i, j] * push
+                    h[j] += abs(W[i, j]) * size + rounding
+    for l in range(min(k, p) - 1, -1, -1):
+        lo, hi = start[l], start[l + 1]
+        a, r = first[l], first[l + 1] - first[l]
+        if r == 0:
+            continue
+        if work.triangular[l]:  # Lᵀ λ = −g
+            for i in range(r - 1, -1, -1):
+                s = -g[a + i]
+                size = h[a + i]
+                for j in range(i + 1, r):
+                    s -= W[lo + j, a + i] * lam[rows[lo + j], k]
+                    size += abs(W[lo + j, a + i]) * doubt[rows[lo + j], k]
+                lam[rows[lo + i], k] = s / W[lo + i, a + i]
+                doubt[rows[lo + i], k] = size / abs(W[lo + i, a + i])
+        else:  # λ = −T R⁻ᵀ g, the least-norm one
+            for i in range(r):
+                s = -g[a + i]
+                size = h[a + i]
+                for j in range(i):
+                    s -= R[a + j, a + i] * z[j]
+                    size += abs(R[a + j, a + i]) * y[j]
+                z[i] = s / R[a + i, a + i]
+                y[i] = size / R[a + i, a + i]
             for i in range(lo, hi):
-                s = lam[rows[i], k]
-                if s != 0.0:
-                    size = doubt[rows[i], k]
-                    rough = SMEAR * length[i] * abs(s)
-                    for j in range(a):
-                        if W[i, j] != 0.0:
-                            g[j] += W[i, j] * s
-                            h[j] += abs(W[i, j]) * size + rough
-    return x, w, lam, doubt, rank
+                s = 0.0
+                size = 0.0
+                for j in range(r):
+                    s += T[i, a + j] * z[j]
+                    size += abs(T[i, a + j]) * y[j]
+                lam[rows[i], k] = s
+                doubt[rows[i], k] = size
+        for i in range(lo, hi):
+            s = lam[rows[i], k]
+            if s != 0.0:
+                size = doubt[rows[i], k]
+                rounding = SMEAR * length[i] * abs(s)
+                for j in range(a):
+                    if W[i, j] != 0.0:
+                        g[j] += W[i, j] * s
+                        h[j] += abs(W[i, j]) * size + rounding
 
 
 @njit(cache=True, error_model="numpy")
@@ -435,63 +532,77 @@ def equalities(lower, upper):
 
 
 @njit(cache=True, error_model="numpy")
-def _wrong_sign(i, k_own, side, w, lam, doubt, room, row_norm, scale):
-    """Level at which active row i holds x from the wrong side (−1: none), and by how much."""
-    if abs(w) > room:
-        if w * side > 0.0:
-            return -1, 0.0  # the row cannot be met: it is held whatever its sign below
-        return k_own, abs(w)
-    push = lam[i, k_own] * side
-    if abs(push) > doubt[i, k_own]:
-        return (-1, 0.0) if push > 0.0 else (k_own, -push)
-    for k in range(k_own + 1, lam.shape[1]):
-        push = lam[i, k] * side * row_norm
-        none = doubt[i, k] * row_norm
-        none = max(min(scale[k], none), SURE * none)
-        if push > none:
-            return -1, 0.0
-        if push < -none:
-            return k, -push
-    return -1, 0.0
+def _judge(k, own, side, w, room, push, doubt, row_norm, scale):
+    """Whether column k shows that an active row holds x back: 1 yes, −1 it pushes well, 0 neither.
+
+    A row that holds x from the wrong side would, let go, be met and let a level gain.
+    """
+    if k == own and abs(w) > room:
+        return 1 if w * side < 0.0 else -1  # that it cannot be met decides
+    push *= side
+    none = doubt
+    if k > own:
+        push *= row_norm
+        none = doubt * row_norm
+        none = max(min(scale, none), SURE * none)
+    if push > none:
+        return -1
+    return 1 if push < -none else 0
 
 
 @njit(cache=True, error_model="numpy")
 def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
-    First up to `blocks` rounds that take in every violated row and let go every row of wrong sign
-    at once; they are fast and need not end. Then up to `pivots` steps of the primal method that
-    moves one row at a time and improves the levels in their order at every step (as LexLSI,
-    Dimitrov, Sherikov & Wieber 2015). Returns x, lam and rank as `solve_active` does; whether the
-    search ended or ran out of steps is for the certificate to find out.
+    First up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
+    at once, for as long as there are ever fewer of them. Then steps that move one row each, as
+    the primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
+    Sherikov & Wieber 2015); with blocks = 0 it is that method, from x = 0. Ends after
+    blocks + pivots steps at the latest; whether it found the optimum is for the certificate to
+    say. rank_tolerance < 0 asks for the default; `dust` is explained at `_reduce`.
+
+    Returns x (n,), the multipliers (M, p + 1) explained at `_column`, and rank (p,).
     """
     M, n = A.shape
     p = len(off) - 1
-    target = np.zeros(M)
-    slack = np.empty(M)
-    scale = np.empty(p + 1)
+    work = _work(M, n, p)
     own = np.empty(M, np.int64)
+    rough = np.empty(p)
     for k in range(p):
+        demanding = False  # a limit's rank is never cut
         for i in range(off[k], off[k + 1]):
             own[i] = k
-    start = np.zeros(n)  # the point the one-row-at-a-time method has reached
+            demanding |= act[i] == 2
+        if rank_tolerance < 0.0 or not demanding:
+            rough[k] = max(off[k + 1] - off[k], n) * EPS * frobenius[k]
+        else:
+            rough[k] = rank_tolerance * frobenius[k]
+    x = np.zeros(n)
+    w = np.zeros(M)
+    lam = np.zeros((M, p + 1))
+    doubt = np.empty((M, p + 1))
+    target = np.zeros(M)
+    slack = np.empty(M)
+    start = np.zeros(n)  # the point that the steps of one row have reached
+    side = np.zeros(M, np.int8)  # of the bound that x breaks
+    open_ = np.empty(M, np.bool_)  # active rows that no column has decided on yet
+    wrong = np.empty(M, np.bool_)
     kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
     last = -1  # row and side let go in the step before
     last_side = 0
+    fewest = M + 1
+    single = blocks == 0
+    if single:
+        for i in range(M):
+            if act[i] != 2:
+                act[i] = 1 if upper[i] < 0.0 else (-1 if lower[i] > 0.0 else 0)
+    begun = 0  # the step at which one row at a time began
     for step in range(blocks + pivots):
-        single = step >= blocks
-        if step == blocks:  # begin again, from x = 0
-            for i in range(M):
-                if act[i] != 2:
-                    act[i] = 1 if upper[i] < 0.0 else (-1 if lower[i] > 0.0 else 0)
         for i in range(M):
             if act[i] != 0:
                 target[i] = upper[i] if act[i] > 0 else lower[i]
-        x, w, lam, doubt, rank = solve_active(A, target, off, act, frobenius, rank_tolerance, dust)
-        length = 0.0
-        for j in range(n):
-            length += x[j] * x[j]
-        length = np.sqrt(length)
+        _reduce(A, target, off, act, row_norm, frobenius, rough, dust, work, x)
+        length = np.sqrt(_dot(x, x))
         for k in range(p):  # where x vanishes by cancellation, what the levels ask of it counts
             s = 0.0
             for i in range(off[k], off[k + 1]):
@@ -499,79 +610,92 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
                     s += target[i] * target[i]
             if frobenius[k] > 0.0:
                 length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
-        for i in range(M):
-            slack[i] = FEASIBLE * row_norm[i] * length
-        # Rows that x breaks.
-        changed = False
+        # Rows that x breaks, and the first of them on the way.
+        count = 0
         alpha = 1.0
         block = -1
-        side = 0
         for i in range(M):
+            slack[i] = FEASIBLE * row_norm[i] * length
+            side[i] = 0
             if act[i] != 0:
                 continue
-            goal = 0.0
-            for j in range(n):
-                goal += A[i, j] * x[j]
+            goal = _dot(A[i], x)
             if goal > upper[i] + slack[i] + FEASIBLE * abs(upper[i]):
-                bound, direction = upper[i], 1
+                bound, side[i] = upper[i], 1
             elif goal < lower[i] - slack[i] - FEASIBLE * abs(lower[i]):
-                bound, direction = lower[i], -1
+                bound, side[i] = lower[i], -1
             else:
                 continue
-            changed = True
-            if not single:
-                act[i] = 3 * direction  # marked, so that its sign is not judged in this round
-                continue
-            here = 0.0
-            for j in range(n):
-                here += A[i, j] * start[j]
+            count += 1
+            here = _dot(A[i], start)
             ratio = max(0.0, (bound - here) / (goal - here)) if goal != here else 0.0
             if ratio < alpha or block < 0:
-                alpha, block, side = ratio, i, direction
-        if single and block >= 0:
+                alpha, block = ratio, i
+        # Rows that hold x back although a level would gain by letting go; the worst of them.
+        drop = -1
+        if not single or block < 0:
+            _weigh(target, work, w)
+            for i in range(M):
+                open_[i] = act[i] != 0 and act[i] != 2 and not kept[i]
+                wrong[i] = False
+            for k in range(p + 1):
+                _column(k, work, lam, doubt)
+                scale = length
+                if k < p:
+                    s = 0.0
+                    for i in range(off[k], off[k + 1]):
+                        s += w[i] * w[i]
+                    scale = frobenius[k] * np.sqrt(s)
+                scale *= SIGNED
+                seen = drop >= 0
+                worst = 0.0
+                for i in range(off[min(k + 1, p)]):
+                    if not open_[i]:
+                        continue
+                    room = slack[i] + FEASIBLE * abs(target[i])
+                    says = _judge(
+                        k, own[i], act[i], w[i], room, lam[i, k], doubt[i, k], row_norm[i], scale
+                    )
+                    open_[i] = says == 0
+                    if says <= 0:
+                        continue
+                    wrong[i] = True
+                    count += 1
+                    size = abs(lam[i, k]) * (row_norm[i] if k > own[i] else 1.0)
+                    late = 2 * (step - begun) > pivots  # Bland: the first one, so that it ends
+                    if not seen and (drop < 0 or (size > worst and not late)):
+                        drop, worst = i, size
+                if single and drop >= 0:
+                    break
+        if count == 0:
+            break
+        if not single:
+            if count < fewest and step + 1 < blocks:
+                fewest = count
+                for i in range(M):
+                    if wrong[i]:
+                        act[i] = 0
+                    elif side[i] != 0:
+                        act[i] = side[i]
+                continue
+            single = True
+            begun = step
+        if block >= 0:
             for j in range(n):
                 start[j] += alpha * (x[j] - start[j])
-            act[block] = side
+            act[block] = side[block]
             # A row let go for good reason cannot be the next one met: its sign was rounding.
-            if block == last and side == last_side:
+            if block == last and side[block] == last_side:
                 kept[block] = True
             elif alpha > STILL:
                 kept[:] = False
             last = -1
-            continue
-        last = -1
-        start[:] = x
-        # Rows that hold x back although a level would gain by letting go.
-        for k in range(p):
-            s = 0.0
-            for i in range(off[k], off[k + 1]):
-                s += w[i] * w[i]
-            scale[k] = SIGNED * frobenius[k] * np.sqrt(s)
-        scale[p] = SIGNED * length
-        drop = -1
-        level = p + 1
-        worst = 0.0
-        for i in range(M):
-            if act[i] == 3 or act[i] == -3:
-                act[i] //= 3
-                continue
-            if act[i] == 0 or act[i] == 2 or kept[i]:
-                continue
-            room = slack[i] + FEASIBLE * abs(target[i])
-            k, push = _wrong_sign(i, own[i], act[i], w[i], lam, doubt, room, row_norm[i], scale)
-            if k < 0:
-                continue
-            changed = True
-            if not single:
-                act[i] = 0
-            elif 2 * (step - blocks) > pivots:  # Bland: the first one, so that it ends
-                drop = i
-                break
-            elif k < level or (k == level and push > worst):
-                drop, level, worst = i, k, push
-        if drop >= 0:
+        else:
+            start[:] = x
             last, last_side = drop, act[drop]
             act[drop] = 0
-        if not changed:
-            break
-    return x, lam, rank
+    else:
+        _weigh(target, work, w)
+        for k in range(p + 1):
+            _column(k, work, lam, doubt)
+    return x, lam, work.first[1:] - work.first[:-1]

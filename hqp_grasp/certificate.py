@@ -43,11 +43,12 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     """Residuals, and which columns of `lam` (M, p or p + 1) fail to prove their level optimal.
 
     `left`: rank tolerance; a level may leave that part of its residual. With least_norm, column
-    p must prove that x is the shortest optimum. Returns w (M,) with residuals of the size of
-    rounding set to 0, pull (M,) the residuals as they are, since a small one of a large row may
-    balance the others, push (M,) 0 where a row may not push, 1 upwards, −1 downwards, 2 both,
-    imbalance (n, columns) and scale (n, columns): what is left of each level's pull on each
-    unknown, and how much of that counts as none: what its own rows' rooms would make up for.
+    p must prove that x is the shortest optimum. Returns whether none fails; w (M,) with residuals
+    of the size of rounding set to 0, and missed (p,), the levels with others; pull (M,) the
+    residuals as they are, since a small one of a large row may balance the others; push (M,) 0
+    where a row may not push, 1 upwards, −1 downwards, 2 both; imbalance (n, columns) and scale
+    (n, columns): what is left of each level's pull on each unknown, and how much of that counts as
+    none: what its own rows' rooms would make up for.
     """
     M, n = A.shape
     p = len(off) - 1
@@ -61,6 +62,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     for j in range(n):
         length += x[j] * x[j]
     length = np.sqrt(length)
+    proven = np.isfinite(length)
     for k in range(p):
         asked = 0.0
         for i in range(off[k], off[k + 1]):
@@ -77,6 +79,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     scale = np.zeros((n, columns))
     push = np.zeros(M, np.int8)
     own = np.empty(M, np.int64)
+    missed = np.empty(p, np.bool_)
     for k in range(p):
         rest = 0.0
         for i in range(off[k], off[k + 1]):
@@ -98,6 +101,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
             if push[i] != 0:
                 for j in range(n):
                     scale[j, k] += abs(A[i, j]) * room
+        missed[k] = rest > 0.0
         for j in range(n):
             scale[j, k] += left * frobenius[k] * np.sqrt(rest)
     if least_norm:
@@ -138,7 +142,8 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                 terms += abs(A[i, j] * forces[i, k])
             imbalance[j, k] = s
             scale[j, k] += min(scale[j, k], ROUNDING * terms)  # huge multipliers prove nothing
-    return w, pull, push, imbalance, scale
+            proven &= abs(s) <= scale[j, k]
+    return proven, w, missed, pull, push, imbalance, scale
 
 
 def optimality_faults(
@@ -151,24 +156,29 @@ def optimality_faults(
     tol: float,
     left: float = 0.0,
     least_norm: bool = False,
-) -> tuple[np.ndarray, list[str]]:
-    """Residuals w (M,), and what keeps x from being certified: an empty list where nothing does."""
-    if not np.isfinite(x).all():
-        return np.full(len(A), np.nan), ["x is not finite"]
-    w, miss, push, imbalance, scale = check(
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Residuals w (M,), levels that have some (p,), and what keeps x from being certified.
+
+    The list is empty where nothing does.
+    """
+    proven, w, missed, pull, push, imbalance, scale = check(
         A, lower, upper, off, x, multipliers, tol, left, least_norm
     )
-    faults = []
+    faults: list[str] = []
+    if proven:
+        return w, missed, faults
+    if not np.isfinite(x).all():
+        return w, missed, ["x is not finite"]
     for k in np.flatnonzero(~(np.abs(imbalance) <= scale).all(axis=0)):
         last = k == len(off) - 1
         above = slice(0, off[k])
         own = slice(off[k], off[k + 1]) if not last else slice(0, 0)
-        pull = x if last else A[own].T @ miss[own]
-        rest = _least_imbalance(pull, A[above], push[above], scale[:, k])
+        force = x if last else A[own].T @ pull[own]
+        rest = _least_imbalance(force, A[above], push[above], scale[:, k])
         if not rest <= 1.0:
             name = "least norm of x" if last else f"level {k}"
             faults.append(f"{name}: imbalance is {rest:.1e} of what counts as none")
-    return w, faults
+    return w, missed, faults
 
 
 def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: np.ndarray) -> float:

@@ -24,9 +24,9 @@ from hqp_grasp.level import (
     stack,
 )
 
-QUICK_ROUNDS = 5  # rounds of the active-set search before it moves one row at a time,
-QUICK_PIVOTS = 60  # and steps of that before the backend is asked
-POLISH_ROUNDS = 20  # rounds allowed to settle the active set that a backend names
+QUICK_ROUNDS = 10  # rounds at most of the active-set search before it moves one row at a time,
+QUICK_PIVOTS = 100  # and steps of that before another way is tried
+POLISH_ROUNDS = 20  # the same, to settle the active set that a backend names
 PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
 DRAWS = 2  # times that bounds are drawn apart
 COARSE = 1e-13  # [–] of a row: at last, rows dependent to this are taken as dependent
@@ -106,7 +106,9 @@ class HQP:
         except _BackendError as failure:
             failed.append(f"{self.solver}: {failure}")
         else:
-            found = self._settle(levels, rows, norms, act, self.solver, failed, POLISH_ROUNDS, 0)
+            found = self._settle(
+                levels, rows, norms, act, self.solver, failed, POLISH_ROUNDS, QUICK_PIVOTS
+            )
             if found is not None:
                 return found
         steps = PIVOTS_PER_ROW * sum(rows.A.shape)
@@ -114,7 +116,7 @@ class HQP:
             act = equalities.copy()
             if draw:
                 _loosened_active_set(rows, norms, act, draw, dust)
-            budget = (POLISH_ROUNDS, 0) if draw else (0, steps)
+            budget = (POLISH_ROUNDS, QUICK_PIVOTS) if draw else (0, steps)
             found = self._settle(
                 levels, rows, norms, act, "one row at a time", failed, *budget, dust
             )
@@ -173,7 +175,7 @@ class HQP:
     ) -> Solution | None:
         """The answer, where it passes its certificate; None, with the reason in `failed`."""
         left = self.rank_tolerance or 0.0
-        residual, faults = optimality_faults(
+        residual, missed, faults = optimality_faults(
             rows.A,
             rows.lower,
             rows.upper,
@@ -187,14 +189,13 @@ class HQP:
         if faults:
             failed.append(f"{method}: {faults[0]}")
             return None
-        reports = []
-        begin = 0
-        for k, level in enumerate(levels):
-            w = residual[begin : begin + len(level.lower)]
-            begin += len(w)
-            reports.append(
-                LevelReport(level.name, w, int(rank[k]), "nearest" if w.any() else "met")
+        off = rows.offsets.tolist()
+        reports = [
+            LevelReport(level.name, residual[begin:end], r, "nearest" if miss else "met")
+            for level, begin, end, r, miss in zip(
+                levels, off, off[1:], rank.tolist(), missed.tolist(), strict=False
             )
+        ]
         return Solution(x, tuple(reports), act, multipliers, method, tuple(failed), left)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
+from numba import njit, types
 
 from hqp_grasp.certificate import optimality_faults
 from hqp_grasp.errors import InputError
@@ -21,7 +22,24 @@ def _floats(name: str, value: object, ndim: int) -> np.ndarray:
         raise InputError(f"Level.{name} must be an array of numbers; got {value!r}") from error
     if array.ndim != ndim:
         raise InputError(f"Level.{name} must have {ndim} dimension(s); got shape {array.shape}")
-    return array
+    return array if array.flags.aligned else array.copy()
+
+
+_VECTOR = types.Array(types.float64, 1, "A", readonly=True)  # any strides, never written to
+_MATRIX = types.Array(types.float64, 2, "A", readonly=True)
+
+
+@njit(types.boolean(_MATRIX, _VECTOR, _VECTOR), cache=True, error_model="numpy")
+def _constructs(A, lower, upper):  # type: ignore[no-untyped-def]
+    """Whether all is as `Level` asks; NaN compares false."""
+    m, n = A.shape
+    for i in range(m):
+        if not lower[i] <= upper[i] or lower[i] == np.inf or upper[i] == -np.inf:
+            return False
+        for j in range(n):
+            if not np.isfinite(A[i, j]):
+                return False
+    return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,30 +65,28 @@ class Level:
                 f"Level bounds must have one entry for each of the {m} rows of A; "
                 f"lower has {lower.shape}, upper has {upper.shape}"
             )
-        # One reduction finds every fault: NaN compares false, inf − inf is NaN.
-        if not (np.isfinite(A).all() and (lower <= upper).all()):
-            self._explain(A, lower, upper)
-        if m and (lower.max() == np.inf or upper.min() == -np.inf):
-            self._explain(A, lower, upper)
+        if not _constructs(A, lower, upper):
+            raise self._fault(A, lower, upper)
         object.__setattr__(self, "A", A)
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
 
-    def _explain(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    def _fault(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> InputError:
+        """What keeps the first faulty row from being one."""
         label = f"Level {self.name!r}" if self.name else "Level"
-        for row in range(len(A)):
-            low, high = lower[row], upper[row]
-            if not np.isfinite(A[row]).all():
-                raise InputError(f"{label}: row {row} of A is not finite: {A[row]}")
-            if np.isnan(low) or np.isnan(high):
-                raise InputError(f"{label}: row {row} has a NaN bound: [{low}, {high}]")
-            if low > high:
-                raise InputError(f"{label}: row {row} has lower > upper: [{low}, {high}]")
-            if low == np.inf or high == -np.inf:
-                raise InputError(
-                    f"{label}: row {row} asks for an infinite value: [{low}, {high}]; "
-                    "use lower = −inf or upper = +inf for a side without bound"
-                )
+        sound = np.isfinite(A).all(axis=1) & (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
+        row = int(np.argmin(sound))
+        low, high = lower[row], upper[row]
+        if not np.isfinite(A[row]).all():
+            return InputError(f"{label}: row {row} of A is not finite: {A[row]}")
+        if np.isnan(low) or np.isnan(high):
+            return InputError(f"{label}: row {row} has a NaN bound: [{low}, {high}]")
+        if low > high:
+            return InputError(f"{label}: row {row} has lower > upper: [{low}, {high}]")
+        return InputError(
+            f"{label}: row {row} asks for an infinite value: [{low}, {high}]; "
+            "use lower = −inf or upper = +inf for a side without bound"
+        )
 
     @classmethod
     def equal(cls, A: np.ndarray, b: np.ndarray, name: str = "") -> Level:
@@ -127,7 +143,7 @@ class Solution:
         that.
         """
         rows = stack(levels)
-        _, faults = optimality_faults(
+        _, _, faults = optimality_faults(
             rows.A,
             rows.lower,
             rows.upper,

@@ -35,7 +35,7 @@ def _solve(G: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 class _Levels:
-    """Lexicographic least squares of the active rows; fields as `active_set.solve_active`."""
+    """Lexicographic least squares of the active rows; lam and doubt as in `active_set._column`."""
 
     def __init__(self, A: np.ndarray, target: np.ndarray, off: np.ndarray, act: np.ndarray) -> None:
         M, n = A.shape

@@ -49,7 +49,7 @@ def test_a_problem_that_was_solved_wrongly_has_the_reference_optimum(seed, index
 
 
 def test_many_digits_find_what_double_precision_cannot():
-    levels = [Level(*rows) for rows in problem(32, 1938)]
+    levels = [Level(*rows) for rows in problem(33, 28774)]
     answer = HQP().solve(levels)
     assert answer.method == "many digits"
     assert answer.is_optimal(levels)
