@@ -110,7 +110,8 @@ def _limit_level(limit: mink.Limit, configuration: mink.Configuration, dt: float
         G, h = np.zeros((0, nv)), np.zeros(0)
     _require_width(limit, G, nv)
     kept = h != np.inf
-    G, h = G[kept], h[kept]
+    if not kept.all():
+        G, h = G[kept], h[kept]
     if isinstance(limit, CAPS):
         unit = np.where(h > 0.0, h, 1.0)
         G, h = G / unit[:, None], h / unit
@@ -125,16 +126,20 @@ def _rows(
     tasks: Sequence[BaseTask], configuration: mink.Configuration
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """W (m, nv), e (m,) and μ of tasks at equal priority."""
-    Ws, es, mu = [np.zeros((0, configuration.nv))], [np.zeros(0)], 0.0
+    Ws, es, mu = [], [], 0.0
     for task in tasks:
         _require(task, BaseTask, "priorities")
         W, e, own = task.compute_qp_residual(configuration) or _dense(task, configuration)
         _require_width(task, W, configuration.nv)
-        asks = W.any(axis=1) | (e != 0.0)  # rows without a cost ask for nothing
-        Ws.append(W[asks])
-        es.append(e[asks])
+        asks = W.any(axis=1) | (e != 0.0)
+        if not asks.all():  # rows without a cost ask for nothing
+            W, e = W[asks], e[asks]
+        Ws.append(W)
+        es.append(e)
         mu += own
-    return np.concatenate(Ws), np.concatenate(es), mu
+    if len(tasks) == 1:
+        return Ws[0], es[0], mu
+    return np.concatenate([np.zeros((0, configuration.nv)), *Ws]), np.concatenate([[], *es]), mu
 
 
 def _dense(
