@@ -29,7 +29,7 @@ from hqp_grasp import HQP, InputError, Level
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import OracleError, lexicographic_optimum
-from problems import Rows, general, three_level
+from problems import Rows, general, near_singular, three_level
 
 CHUNK = 50  # problems handed to a worker at once
 SHOWN = 40  # failures listed at most
@@ -49,8 +49,11 @@ class Options:
     """Index of the first problem: to repeat one, or to continue."""
     solver: str = "proxqp"
     """The QP solver."""
-    kind: Literal["general", "three_level-easy", "three_level-mid", "three_level-hard"] = "general"
-    """general: n 1–40, 1–8 levels, anything goes. three_level: 11 unknowns, a box, three tasks."""
+    kind: Literal[
+        "general", "three_level-easy", "three_level-mid", "three_level-hard", "near_singular"
+    ] = "general"
+    """general: n 1–40, 1–8 levels, anything goes. three_level: 11 unknowns, a box, three tasks.
+    near_singular: two of three tasks at an angle of 1e-1 … 1e-16 rad."""
     against_oracle: bool = False
     """Compare with the reference optimum too (some 20 problems a second and job)."""
     shortcuts: bool = True
@@ -76,6 +79,9 @@ def make(kind: str, seed: int, index: int) -> list[Rows]:
     rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
     if kind == "general":
         return general(rng)
+    if kind == "near_singular":
+        angle = 10.0 ** -rng.uniform(1.0, 16.0)
+        return near_singular(rng, angle, *(rng.random(2) < 0.5))
     return three_level(rng, kind.removeprefix("three_level-"))
 
 

@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 ASKED = (1.0, 0.7)  # of the first two levels
 BOX = 2.0  # the limit on every unknown
 FLOOR = 1e-17  # drawn in the place of zero
-STYLES = ("-", "--", "-", "-.", ":")
+STYLES = ("-", "--", "-", "--", "-.", ":")
 
 
 def tasks(angle: float) -> list[hg.Level]:
@@ -37,11 +37,13 @@ def tasks(angle: float) -> list[hg.Level]:
 def answers(angle: float, damping: float, tolerance: float) -> dict[str, np.ndarray]:
     """x (3,) of each choice."""
     levels = tasks(angle)
+    strict = hg.HQP()
     limited = [hg.Level(np.eye(3), np.full(3, -BOX), np.full(3, BOX), "box"), *levels]
     return {
         "strict projection": hg.Projection().solve(levels).x,
-        "strict HQP in a box": hg.HQP().solve(limited).x,
+        "strict HQP in a box": strict.solve(limited).x,
         "SR-inverse": hg.Projection(damping=damping).solve(levels).x,
+        "damped HQP in a box": strict.solve(strict.damped(limited, damping)).x,
         "truncated projection": hg.Projection(rank_tolerance=tolerance).solve(levels).x,
         "truncated HQP in a box": hg.HQP(rank_tolerance=tolerance).solve(limited).x,
     }
@@ -78,7 +80,7 @@ def main(
     """Print and draw ‖x‖ and the residuals of both levels over angles 1e-1 … 1e-14.
 
     Args:
-        damping: λ of the SR-inverse
+        damping: λ of the damped answers
         tolerance: rank tolerance of the truncated answers
         per_decade: angles in each decade; the table shows every second decade
         plot: where to
@@ -94,10 +96,10 @@ def main(
             left = [float(np.linalg.norm(level.residual(x))) for level in levels[:2]]
             seen.setdefault(name, []).append([float(np.linalg.norm(x)), *left])
         if i == 0:
-            print("angle   " + "".join(f"{name:>25}" for name in seen))
+            print("angle   " + "".join(f"{name:>24}" for name in seen))
         if i % (2 * per_decade) == 0 or i == len(exponents) - 1:
             cells = (" ".join(f"{v:.0e}" for v in values[-1]) for values in seen.values())
-            print(f"{angle:<8.0e}" + "".join(f"{cell:>25}" for cell in cells))
+            print(f"{angle:<8.0e}" + "".join(f"{cell:>24}" for cell in cells))
     title = f"box ±{BOX:g}, λ = {damping:g}, rank tolerance {tolerance:g}"
     draw(10.0**-exponents, {k: np.array(v) for k, v in seen.items()}, title, plot)
 

@@ -8,6 +8,8 @@ the best multipliers there are, by non-negative least squares.
 
 from __future__ import annotations
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 from numba import njit
 from scipy.optimize import nnls
@@ -16,8 +18,14 @@ EPS = float(np.finfo(float).eps)
 VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 SIGN_PASSES = 8  # rounds of mending signs before the least-squares search is asked
 SMALL = 1e-11  # [–] of the largest pull: what is left of it on another unknown by rounding
+DIGITS = 80
 LEAN = 1e8  # [–] a level's proof is not added to another's more often than this
-ROUNDING = 1e-13  # [–] of the terms that make up an imbalance; below it, it counts as none
+ROUNDING = 1e-13  # [–] of the terms that make up an imbalance; below it, it counts as none,
+# unless they are huge: next to them any pull is small, and by such terms it could be balanced
+# however wrong x is. Rows that are nearly parallel need them, and then A itself, known to EPS,
+# tells no more:
+EVALUATED = 8.0 * EPS  # [–] of the terms, however huge,
+LOST = 1e-2  # [–] and of the pull: what may be left
 
 
 @njit(cache=True, error_model="numpy")
@@ -112,6 +120,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
         for k in range(own[i] + 1, columns):
             forces[i, k] = lam[i, k]
     imbalance = np.empty((n, columns))
+    terms = np.empty(n)  # sums of the sizes of what makes it up
     for k in range(columns):
         for _ in range(SIGN_PASSES):
             mended = False
@@ -134,14 +143,23 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                     forces[i, k] = 0.0  # it may not push like that; what is then missing, shows
             if not mended:
                 break
+        pulls = 0.0  # the level's own, to be balanced
         for j in range(n):
             s = x[j] if k == p else 0.0
-            terms = 0.0
-            for i in range(off[min(k + 1, p)]):
+            terms[j] = 0.0
+            for i in range(off[min(k, p)], off[min(k + 1, p)]):
                 s += A[i, j] * forces[i, k]
-                terms += abs(A[i, j] * forces[i, k])
+                terms[j] += abs(A[i, j] * forces[i, k])
             imbalance[j, k] = s
-            scale[j, k] += min(scale[j, k], ROUNDING * terms)  # huge multipliers prove nothing
+            pulls = max(pulls, abs(s))
+        for j in range(n):
+            s = imbalance[j, k]
+            for i in range(off[min(k, p)]):
+                s += A[i, j] * forces[i, k]
+                terms[j] += abs(A[i, j] * forces[i, k])
+            imbalance[j, k] = s
+            small = min(scale[j, k], ROUNDING * terms[j])
+            scale[j, k] += max(small, min(EVALUATED * terms[j], LOST * pulls))
             proven &= abs(s) <= scale[j, k]
     return proven, w, missed, pull, push, imbalance, scale
 
@@ -184,25 +202,74 @@ def optimality_faults(
 def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: np.ndarray) -> float:
     """Largest entry of (pull + Aᵀ λ) / scale for the best λ in the least-squares sense.
 
-    λ is free where push is 2, of push's sign where ±1, and 0 where push is 0.
+    λ is free where push is 2, of push's sign where ±1, and 0 where push is 0. What the free rows
+    can balance is taken out first, in many digits where double precision does not do: rows that
+    are nearly parallel balance with multipliers whose last digit is already too coarse.
     """
-    size = np.maximum(scale, SMALL * np.abs(pull).max())
     if not pull.any():
         return 0.0
-    pull, A = pull / size, A / size
-    norm = np.linalg.norm(A, axis=1)
-    real = norm > 0.0
-    unit, push = A[real] / norm[real, None], push[real]
-    free = unit[push == 2]
-    signed = np.concatenate([unit[push == 1], -unit[push == -1]])
+    size = np.maximum(scale, SMALL * np.abs(pull).max())
+    free, signed = A[push == 2], np.concatenate([A[push == 1], -A[push == -1]])
+    for without in (_without, _without_in_many_digits):
+        rest, rows = without(free, pull, signed, size)
+        length = float(np.linalg.norm(rest))
+        if length > 0.0 and len(rows):
+            best, _ = nnls(rows.T, -rest / length, maxiter=30 * (1 + len(rows)))
+            rest = rest + length * (rows.T @ best)
+        imbalance = float(np.abs(rest).max())
+        if imbalance <= 1.0:
+            break
+    return imbalance
+
+
+def _without(
+    free: np.ndarray, pull: np.ndarray, signed: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """pull / size and the directions of signed / size without what lies in span(free / size)."""
+    rest, rows = pull / size, _directions(signed / size)
+    free = _directions(free / size)
     if len(free):
         _, sigma, Vt = np.linalg.svd(free, full_matrices=False)
         basis = Vt[sigma > EPS * max(free.shape) * sigma[0]]
         for _ in range(2):
-            pull = pull - basis.T @ (basis @ pull)
-            signed = signed - (signed @ basis.T) @ basis
-    length = float(np.linalg.norm(pull))
-    if length == 0.0 or not len(signed):
-        return float(np.abs(pull).max())
-    best, _ = nnls(signed.T, -pull / length, maxiter=30 * (1 + len(signed)))
-    return float(np.abs(pull + length * (signed.T @ best)).max())
+            rest = rest - basis.T @ (basis @ rest)
+            rows = rows - (rows @ basis.T) @ basis
+    return rest, rows
+
+
+def _without_in_many_digits(
+    free: np.ndarray, pull: np.ndarray, signed: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same as `_without`, by Gram–Schmidt on decimals."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        unit = decimals(size)
+        rest, rows = decimals(pull) / unit, decimals(signed) / unit
+        left = decimals(free) / unit
+        for group in (rows, left):
+            for row in group:
+                row /= (row @ row).sqrt() or 1
+        basis: list[np.ndarray] = []
+        for q in left:  # in the order of the levels, as ranks are told
+            for _ in range(2):
+                for known in basis:
+                    q = q - (q @ known) * known
+            norm = (q @ q).sqrt()
+            if norm > EPS * len(basis):
+                q = q / norm
+                basis.append(q)
+                rest = rest - (rest @ q) * q
+                rows = rows - np.outer(rows @ q, q)
+        return rest.astype(float), rows.astype(float)
+
+
+def _directions(rows: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(rows, axis=1)
+    return rows[norm > 0.0] / norm[norm > 0.0, None]
+
+
+def decimals(values: np.ndarray) -> np.ndarray:
+    """`values` as decimal numbers, exactly."""
+    return np.array([Decimal(v) for v in values.ravel().tolist()], dtype=object).reshape(
+        values.shape
+    )

@@ -133,6 +133,47 @@ class HQP:
                 return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
 
+    def damped(
+        self,
+        levels: Sequence[Level],
+        damping: float | Sequence[float],
+        reference: np.ndarray | None = None,
+    ) -> list[Level]:
+        """Return levels that ask only for what is reached with x held back; then `solve` those.
+
+        In their order each level with equalities is solved, under those above, beside the rows
+        √λ x = √λ reference, and asks from then on for the A x that was found. So the levels stay
+        strict, limits hold, and near a loss of rank x stays short. On equalities alone the answer
+        is Projection(damping=λ)'s; its q_c is the `reference` (n,), here 0 unless given.
+
+        `damping`: λ ≥ 0 in the squared units of A, one for all or one for each level; levels of
+        inequalities only, and levels with λ = 0, stay as they are.
+        """
+        n = stack(levels).A.shape[1]
+        each = _numbers(damping)
+        if each.shape not in ((), (len(levels),)) or not (np.isfinite(each) & (each >= 0.0)).all():
+            raise InputError(
+                f"damping must be ≥ 0, one number or one for each level; got {damping!r}"
+            )
+        toward = np.zeros(n) if reference is None else _numbers(reference)
+        if toward.shape != (n,) or not np.isfinite(toward).all():
+            raise InputError(f"reference must be {n} finite numbers; got {reference!r}")
+        held: list[Level] = []
+        for level, square in zip(levels, np.broadcast_to(each, len(levels)), strict=True):
+            if square == 0.0 or level.is_inequality:
+                held.append(level)
+                continue
+            root = np.sqrt(square)
+            A = np.concatenate([level.A, root * np.eye(n)])
+            lower, upper = (np.append(b, root * toward) for b in (level.lower, level.upper))
+            value = level.A @ self.solve([*held, Level(A, lower, upper)]).x
+            equal = level.lower == level.upper
+            lower = np.where(equal, value, np.minimum(level.lower, value))
+            upper = np.where(equal, value, np.maximum(level.upper, value))
+            name = f"{level.name}, damped" if level.name else "damped"
+            held.append(Level(level.A, lower, upper, name))
+        return held
+
     def _settle(
         self,
         levels: Sequence[Level],
@@ -197,6 +238,14 @@ class HQP:
             )
         ]
         return Solution(x, tuple(reports), act, multipliers, method, tuple(failed), left)
+
+
+def _numbers(value: object) -> np.ndarray:
+    """`value` as an array; NaN where it is none."""
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return np.array(np.nan)
 
 
 def _loosened_active_set(

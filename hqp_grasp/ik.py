@@ -81,19 +81,13 @@ def ik_levels(
         levels.append(Level.equal(J, -task.gain * error, type(task).__name__))
     if isinstance(priorities, BaseTask):
         raise InputError("priorities must be a list of tasks or of lists of tasks; got one task")
+    dampings = [0.0] * len(levels)
     for priority in priorities:
         tasks = [priority] if isinstance(priority, BaseTask) else list(priority)
-        name = " + ".join(type(task).__name__ for task in tasks)
         W, e, mu = _rows(tasks, configuration)
-        mu += damping
-        if mu > 0.0:
-            name += ", damped"
-            calm = Level.equal(
-                np.concatenate([W, np.sqrt(mu) * np.eye(nv)]), np.append(e, np.zeros(nv)), name
-            )
-            e = W @ (hqp or HQP()).solve([*levels, calm]).x
-        levels.append(Level.equal(W, e, name))
-    return levels
+        levels.append(Level.equal(W, e, " + ".join(type(task).__name__ for task in tasks)))
+        dampings.append(mu + damping)
+    return (hqp or HQP()).damped(levels, dampings) if any(dampings) else levels
 
 
 def _rank(limit: mink.Limit) -> Rank:

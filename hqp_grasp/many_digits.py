@@ -12,12 +12,10 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-DIGITS = 80
+from hqp_grasp.certificate import DIGITS, EPS, decimals
+
+DUST = Decimal(EPS)  # [–] of a row, for each it is reduced by: A is not known to more
 NONE = Decimal(10) ** -40  # [–] of the terms of a sum: what is left of them, where they cancel
-
-
-def _decimal(values: np.ndarray) -> np.ndarray:
-    return np.array([Decimal(float(v)) for v in values.flat], dtype=object).reshape(values.shape)
 
 
 def _solve(G: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -56,7 +54,7 @@ class _Levels:
             while len(rows) and r < n:
                 left = np.array([rest[i] @ rest[i] for i in rows], dtype=object)
                 fresh = [
-                    s if s > (NONE * size[i]) ** 2 else Decimal(0)
+                    s if s > (DUST * r * size[i]) ** 2 else Decimal(0)
                     for s, i in zip(left, rows, strict=True)
                 ]
                 pick = max(range(len(rows)), key=fresh.__getitem__)
@@ -106,7 +104,7 @@ class _Levels:
                 own = lower[j][:, a:b]
                 gram = own.T @ own
                 push = own @ _solve(gram, -g[a:b])
-                inverse = np.array([_solve(gram, e) for e in _decimal(np.eye(b - a))])
+                inverse = np.array([_solve(gram, e) for e in decimals(np.eye(b - a))])
                 doubt = abs(own @ inverse) @ h[a:b]
                 self.lam[groups[j], k], self.doubt[groups[j], k] = push, doubt
                 if a:
@@ -138,7 +136,7 @@ def _search(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     M = len(A)
     own = np.repeat(np.arange(len(off) - 1), np.diff(off))
-    exact = _decimal(A)
+    exact = decimals(A)
     size = np.array([(a @ a).sqrt() for a in exact], dtype=object)
     low = [Decimal(float(b)) for b in lower]  # decimals know infinity
     high = [Decimal(float(b)) for b in upper]

@@ -43,10 +43,11 @@ def three_level(rng, difficulty):
     return [box(n, 0.25), *tasks]
 
 
-def near_singular(rng, angle, limits=True):
+def near_singular(rng, angle, limits=True, agree=False):
     """n = 11: level 2 spans the rows of level 1 turned by `angle` [rad] in three planes.
 
-    A box of ±0.25 comes first (without it x grows like 1/angle), a posture of 11 rows last.
+    A box of ±0.25 comes first (without it x grows like 1/angle), a posture of 11 rows last. Where
+    both levels `agree`, a point of the box meets them.
     """
     n, m = 11, 3
     Q = np.linalg.qr(rng.standard_normal((n, n)))[0].T
@@ -57,6 +58,9 @@ def near_singular(rng, angle, limits=True):
         equal(mix @ turned, 0.1 * rng.standard_normal(m)),
         equal(np.eye(n), 0.1 * rng.standard_normal(n)),
     ]
+    if agree:
+        point = rng.uniform(-0.1, 0.1, n)
+        levels[:2] = [equal(level.A, level.A @ point) for level in levels[:2]]
     return [box(n, 0.25), *levels] if limits else levels
 
 

@@ -133,6 +133,26 @@ def test_the_damped_form_holds_at_a_singularity_too():
 # ---------------------------------------------------------------- strict − damped = O(λ)
 
 
+@pytest.mark.parametrize("damping", [1e-6, 1e-2, 10.0])
+def test_levels_damped_one_after_the_other_are_the_damped_projection(damping):
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(3, 12))
+        sizes = rng.integers(1, 4, size=rng.integers(1, 4))
+        problem = [equal(conditioned(rng, m, n), rng.standard_normal(m)) for m in sizes]
+        reference = np.zeros(n)
+        if len(sizes) > 1 and rng.random() < 0.5:
+            reference = rng.standard_normal(n)
+            problem.append(equal(np.eye(n), reference))
+        elif len(sizes) > 1 and sizes[-1] >= n:
+            continue  # Projection would take the last level's answer as the reference
+        hqp = HQP()
+        levels = hqp.damped(built(problem), damping, reference)
+        answer = hqp.solve(levels)
+        assert answer.is_optimal(levels)
+        assert gap(answer.x, projection(problem, damping)) < TOL
+
+
 def test_damped_and_strict_differ_by_a_constant_times_the_damping():
     """q̇_λ − q̇_0 = −λ Jᵀ(JJᵀ)⁻¹(JJᵀ + λI)⁻¹(ẋ − J q̇_c): the slope in log-log is one.
 

@@ -486,10 +486,11 @@ def test_levels_are_not_changed_by_solving_them():
 # ---------------------------------------------------------------- near a loss of rank
 
 
+@pytest.mark.parametrize("agree", [False, True])
 @pytest.mark.parametrize("angle", ANGLES, ids="{:.0e}".format)
-def test_nearly_parallel_levels_are_answered_within_their_limits(angle):
+def test_nearly_parallel_levels_are_answered_within_their_limits(angle, agree):
     for seed in range(3):
-        problem = near_singular(np.random.default_rng(seed), angle)
+        problem = near_singular(np.random.default_rng(seed), angle, agree=agree)
         _, misses = lexicographic_optimum(problem)
         for solver in ("proxqp", "daqp"):
             answer = solve(problem, solver)
@@ -505,6 +506,39 @@ def test_any_rank_tolerance_gives_a_certified_answer_within_the_limits(angle, to
         problem = near_singular(np.random.default_rng(seed), angle)
         answer = solve(problem, rank_tolerance=tolerance)
         assert np.abs(answer.x).max() <= 0.25 * (1.0 + TOL)
+
+
+@pytest.mark.parametrize("damping", [1e-8, 1e-4, 1.0])
+@pytest.mark.parametrize("angle", ANGLES[::2], ids="{:.0e}".format)
+def test_damped_levels_are_certified_and_stay_within_the_limits(angle, damping):
+    for seed in range(3):
+        levels = HQP().damped(built(near_singular(np.random.default_rng(seed), angle)), damping)
+        answer = HQP().solve(levels)
+        assert answer.is_optimal(levels)
+        assert np.abs(answer.x).max() <= 0.25 * (1.0 + TOL)
+
+
+def test_damping_weighs_the_miss_of_a_level_against_the_length_of_x():
+    """min (x₁ + x₂ − 2)² + λ ‖x‖² with x₂ ≤ 0.1, by hand: x₁ = (2 − 0.1) / (1 + λ)."""
+    damping = 0.5
+    limit = Level([[0.0, 1.0]], [-INF], [0.1])
+    levels = HQP().damped([limit, Level.equal([[1.0, 1.0]], [2.0], "sum")], damping)
+    assert levels[0] is limit and levels[1].name == "sum, damped"
+    assert_same_point(HQP().solve(levels).x, [1.9 / (1.0 + damping), 0.1])
+
+
+def test_a_damped_level_admits_what_its_own_inequalities_were_left_with():
+    """min (x − 1)² + (x + 1)²₊ + λ x², the second for x ≤ −1, by hand: x = 0."""
+    levels = HQP().damped([Level([[1.0], [1.0]], [1.0, -INF], [1.0, -1.0])], 0.1)
+    assert_same_point(HQP().solve(levels).x, [0.0])
+    assert levels[0].upper[1] == pytest.approx(0.0, abs=TOL) and levels[0].lower[1] == -INF
+
+
+def test_each_level_may_have_a_damping_of_its_own():
+    levels = [Level.equal([[1.0, 0.0]], [1.0]), Level.equal([[0.0, 1.0]], [1.0])]
+    held = HQP().damped(levels, [0.0, 1.0], reference=[0.0, 3.0])
+    assert held[0] is levels[0]
+    assert_same_point(HQP().solve(held).x, [1.0, 2.0])
 
 
 def test_the_rank_tolerance_decides_what_counts_as_independent():
@@ -547,6 +581,19 @@ def test_proxqp_is_the_default_and_the_list_names_no_solver_twice():
 def test_a_rank_tolerance_out_of_range_is_refused(tolerance):
     with pytest.raises(InputError, match="rank_tolerance must lie in"):
         HQP(rank_tolerance=tolerance)
+
+
+@pytest.mark.parametrize("damping", [-1e-9, np.nan, INF, [0.1, -1.0], [0.1], [[0.1, 0.1]]])
+def test_damping_that_is_no_damping_is_refused(damping):
+    levels = built([box(2, 1.0), equal(np.eye(2), np.ones(2))])
+    with pytest.raises(InputError, match=r"damping must be ≥ 0, one number or one for each level"):
+        HQP().damped(levels, damping)
+
+
+@pytest.mark.parametrize("reference", [[0.0], [0.0, np.nan], 1.0, "here"])
+def test_a_reference_that_is_no_point_is_refused(reference):
+    with pytest.raises(InputError, match="reference must be 2 finite numbers"):
+        HQP().damped(built([box(2, 1.0)]), 0.1, reference)
 
 
 def test_levels_of_different_width_are_refused_with_their_widths():
