@@ -12,7 +12,8 @@ order, at blocks of problems. What is timed:
                 The robot is a chain of hinges whose ranges are the box; tasks return the rows
                 ready made, so that a robot's kinematics is in none of the times
     daqp        one call with break_points; it scales rows, and so resolves what cannot be met
-                in a norm of its own
+                in a norm of its own. `rotated` first turns each level's rows among themselves to
+                one length, which leaves nothing to scale; that turn is in none of the times
     projection  the strict recursion; it knows no limits
 
 Wrong is an answer farther than 1e-6 from the reference optimum (tests/oracle.py).
@@ -56,7 +57,7 @@ WARM_UP = 3  # calls at the beginning of a block that are not counted
 REFERENCE = "mink"
 SIZES, SIZES_LEVELS = (6, 11, 16, 24, 32, 40, 50, 60), 4
 LEVELS, LEVELS_SIZE = (2, 3, 4, 5, 6, 7, 8), 20
-DRAWN = ("HQP proxqp", "HQP daqp", "mink", "pink", "daqp break_points", "projection")
+DRAWN = ("HQP proxqp", "HQP daqp", "mink", "pink", "daqp rotated", "projection")
 
 FAILURES = (mink.NoSolutionFound, hg.SolverError, ArithmeticError)  # to answer at all
 if pink is not None:
@@ -179,6 +180,29 @@ def by_daqp(problem: Problem) -> Callable[[], Answer]:
     return call
 
 
+def turned(rows: Rows) -> Rows:
+    """The same equality level, its rows rotated among themselves to equal length."""
+    A, b = rows.A.copy(), rows.upper.copy()
+    mean = np.mean(np.einsum("ij,ij->i", A, A))
+    for i in range(len(A) - 1):  # row i gets the mean length, by turning it with a later one
+        squares = np.einsum("ij,ij->i", A[i:], A[i:])
+        j = i + int(np.argmax((squares - mean) * np.sign(mean - squares[0])))
+        if j == i:
+            continue  # it has it
+        # ‖cos a_i + sin a_j‖² = mean, a quadratic in tan
+        cross = A[i] @ A[j]
+        quadratic = (A[j] @ A[j] - mean, 2.0 * cross, A[i] @ A[i] - mean)
+        tan = np.roots(quadratic).real[0]
+        cos = 1.0 / np.hypot(1.0, tan)
+        turn = cos * np.array([[1.0, tan], [-tan, 1.0]])
+        A[[i, j]], b[[i, j]] = turn @ A[[i, j]], turn @ b[[i, j]]
+    return Rows(A, b, b)
+
+
+def by_daqp_rotated(problem: Problem) -> Callable[[], Answer]:
+    return by_daqp([problem[0], *(turned(rows) for rows in problem[1:])])
+
+
 def by_projection(problem: Problem) -> Callable[[], Answer]:
     form = hg.Projection()
     return lambda: (form.solve([hg.Level(*rows) for rows in problem[1:]]).x, "")
@@ -195,6 +219,7 @@ def methods() -> dict[str, Method]:
     if pink is not None:
         chosen["pink"] = pink_method()
     chosen["daqp break_points"] = by_daqp
+    chosen["daqp rotated"] = by_daqp_rotated
     chosen["projection"] = by_projection
     return chosen
 
@@ -333,28 +358,22 @@ def main(
             table(title, seen, checked)
         return
     growth: dict[str, dict[int, dict[str, Seen]]] = {}
-    label = f"unknowns (with {SIZES_LEVELS} levels)"
-    growth[label] = {}
-    for n in SIZES:
-        growth[label][n] = compare(
-            compared,
-            lambda rng, n=n: scaling(rng, n, SIZES_LEVELS),
-            (seed, 10, n),
-            problems,
-            checked,
-        )
-        table(f"{n} unknowns, {SIZES_LEVELS} levels", growth[label][n], checked)
-    label = f"levels (with {LEVELS_SIZE} unknowns)"
-    growth[label] = {}
-    for count in LEVELS:
-        growth[label][count] = compare(
-            compared,
-            lambda rng, count=count: scaling(rng, LEVELS_SIZE, count),
-            (seed, 11, count),
-            problems,
-            checked,
-        )
-        table(f"{LEVELS_SIZE} unknowns, {count} levels", growth[label][count], checked)
+    for stream, label, points in (
+        (10, f"unknowns (with {SIZES_LEVELS} levels)", [(n, SIZES_LEVELS) for n in SIZES]),
+        (11, f"levels (with {LEVELS_SIZE} unknowns)", [(LEVELS_SIZE, count) for count in LEVELS]),
+    ):
+        growth[label] = {}
+        for n, count in points:
+            grown = n if stream == 10 else count
+            seen = compare(
+                compared,
+                lambda rng, n=n, count=count: scaling(rng, n, count),
+                (seed, stream, grown),
+                problems,
+                checked,
+            )
+            growth[label][grown] = seen
+            table(f"{n} unknowns, {count} levels", seen, checked)
     draw_growth(growth, plot)
 
 

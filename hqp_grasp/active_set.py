@@ -175,9 +175,16 @@ class Work(NamedTuple):
     R: np.ndarray  # (n, n) and their triangular ones
     xq: np.ndarray  # (n,) Qᵀ x
     rhs: np.ndarray  # (M,)
+    target: np.ndarray  # (M,) the bound at which each active row is held
+    slack: np.ndarray  # (M,) how far a row may miss its bound by rounding
     wa: np.ndarray  # (M,) residuals,
     dim: np.ndarray  # (M,) and how much of that may be rounding
+    w: np.ndarray  # (M,) the residuals row by row, without what is rounding
     missed: np.ndarray  # (p,) levels with a residual that is not
+    lam: np.ndarray  # (M, p + 1) multipliers, see `_column`,
+    doubt: np.ndarray  # (M, p + 1) and how much of them may be rounding
+    side: np.ndarray  # (M,) of the bound that x breaks: 1 upper, −1 lower, 0 none
+    wrong: np.ndarray  # (M,) 1 where an active row holds x back
     g: np.ndarray  # (n,) a level's pull on the coordinates above it
     h: np.ndarray  # (n,) and what is doubtful of that
     y: np.ndarray  # (n,)
@@ -187,35 +194,42 @@ class Work(NamedTuple):
 @njit(cache=True, error_model="numpy")
 def _work(M, n, p):
     return Work(
-        np.empty(M, np.int64),
-        np.empty(p + 1, np.int64),
-        np.zeros(p + 1, np.int64),
-        np.empty(p, np.int64),
-        np.empty(p, np.bool_),
-        np.empty(p, np.bool_),
-        np.empty((p, n, n)),
-        np.empty((M, n)),
-        np.empty(M),
-        np.empty(M),
-        np.empty((M, n)),
-        np.empty(M),
-        np.empty(M, np.int64),
-        np.empty((M, n)),
-        np.empty((n, n)),
-        np.empty(n),
-        np.empty(M),
-        np.empty(M),
-        np.empty(M),
-        np.empty(p, np.bool_),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n),
-        np.empty(n),
+        rows=np.empty(M, np.int64),
+        start=np.empty(p + 1, np.int64),
+        first=np.zeros(p + 1, np.int64),
+        made=np.empty(p, np.int64),
+        triangular=np.empty(p, np.bool_),
+        turned=np.empty(p, np.bool_),
+        turn=np.empty((p, n, n)),
+        W=np.empty((M, n)),
+        length=np.empty(M),
+        left=np.empty(M),
+        H=np.empty((M, n)),
+        beta=np.empty(M),
+        column=np.empty(M, np.int64),
+        T=np.empty((M, n)),
+        R=np.empty((n, n)),
+        xq=np.empty(n),
+        rhs=np.empty(M),
+        target=np.zeros(M),
+        slack=np.empty(M),
+        wa=np.empty(M),
+        dim=np.empty(M),
+        w=np.empty(M),
+        missed=np.empty(p, np.bool_),
+        lam=np.empty((M, p + 1)),
+        doubt=np.empty((M, p + 1)),
+        side=np.zeros(M, np.int8),
+        wrong=np.zeros(M, np.int8),
+        g=np.empty(n),
+        h=np.empty(n),
+        y=np.empty(n),
+        z=np.empty(n),
     )
 
 
 @njit(cache=True, error_model="numpy")
-def _pick(work, lo, hi, ma, c, steps, gone, rough):
+def _pick(work, lo, hi, ma, c, steps, dust, rough):
     """Pick rows lo:hi by the largest rest, and turn all rows so that coordinate c + r is theirs.
 
     Returns how many were picked, and whether some came close to the rank tolerance `rough`.
@@ -232,7 +246,7 @@ def _pick(work, lo, hi, ma, c, steps, gone, rough):
         best = 0.0
         pick = row
         for i in range(row, hi):
-            tiny = gone * d * length[i]
+            tiny = dust * d * length[i]
             if left[i] <= tiny * tiny:
                 if left[i] > 0.0:
                     for j in range(d, n):
@@ -331,8 +345,8 @@ def _least_squares(work, lo, hi, c, r):
 
 
 @njit(cache=True, error_model="numpy")
-def _reduce(A, target, off, act, row_norm, frobenius, rough, dust, work, x):
-    """Lexicographic least squares of the rows with act ≠ 0, as equalities at `target`: x.
+def _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x):
+    """Lexicographic least squares of the rows with act ≠ 0, as equalities at their target: x.
 
     What is left of a row, after it is reduced by c others, counts as nothing below `dust` × c of
     its length; singular values, below `rough` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
@@ -375,7 +389,7 @@ def _reduce(A, target, off, act, row_norm, frobenius, rough, dust, work, x):
                         for j in range(c + r, n):
                             W[i, j] = 0.0
         for i in range(lo, hi):
-            rhs[i] = target[rows[i]] - _dot(W[i, :c], xq)
+            rhs[i] = work.target[rows[i]] - _dot(W[i, :c], xq)
         work.triangular[k] = r == m and not work.turned[k]
         if work.triangular[k]:
             for i in range(m):
@@ -412,24 +426,24 @@ def _reduce(A, target, off, act, row_norm, frobenius, rough, dust, work, x):
 
 
 @njit(cache=True, error_model="numpy")
-def _weigh(target, work, w):
-    """w (M,), the residuals of the active rows: those of the size of rounding are none."""
+def _weigh(work):
+    """The residuals of the active rows: those of the size of rounding are none."""
     p = len(work.made)
-    w[:] = 0.0
+    work.w[:] = 0.0
     for k in range(p):
         work.missed[k] = False
         for i in range(work.start[k], work.start[k + 1]):
-            size = abs(target[work.rows[i]])
+            size = abs(work.target[work.rows[i]])
             for j in range(work.first[k + 1]):
                 size += abs(work.W[i, j] * work.xq[j])
             work.dim[i] = LOOSE * size
             if abs(work.wa[i]) > ROUNDING * size:
                 work.missed[k] = True
-                w[work.rows[i]] = work.wa[i]
+                work.w[work.rows[i]] = work.wa[i]
 
 
 @njit(cache=True, error_model="numpy")
-def _column(k, work, lam, doubt):
+def _column(k, work):
     """Column k of lam (M, p + 1), the multipliers of the rows above for level k's optimality.
 
     A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; column p has those of the minimum norm of x. Rows of level
@@ -438,7 +452,7 @@ def _column(k, work, lam, doubt):
     """
     W, T, R, rows, start, first = work.W, work.T, work.R, work.rows, work.start, work.first
     g, h, y, z = work.g, work.h, work.y, work.z
-    length = work.length
+    length, lam, doubt = work.length, work.lam, work.doubt
     p = len(work.made)
     for i in range(len(lam)):
         lam[i, k] = 0.0
@@ -532,22 +546,91 @@ def equalities(lower, upper):
 
 
 @njit(cache=True, error_model="numpy")
-def _judge(k, own, side, w, room, push, doubt, row_norm, scale):
-    """Whether column k shows that an active row holds x back: 1 yes, −1 it pushes well, 0 neither.
+def _judge(own, side, w, room, push, doubt, scale):
+    """Whether a column shows that an active row holds x back: 1 yes, −1 it pushes well, 0 neither.
 
-    A row that holds x from the wrong side would, let go, be met and let a level gain.
+    A row that holds x from the wrong side would, let go, be met and let a level gain. `own`:
+    whether the column is of the row's own level; if not, push and doubt are in units of the row.
     """
-    if k == own and abs(w) > room:
+    if own and abs(w) > room:
         return 1 if w * side < 0.0 else -1  # that it cannot be met decides
-    push *= side
-    none = doubt
-    if k > own:
-        push *= row_norm
-        none = doubt * row_norm
-        none = max(min(scale, none), SURE * none)
-    if push > none:
+    none = doubt if own else max(min(SIGNED * scale, doubt), SURE * doubt)
+    if push * side > none:
         return -1
-    return 1 if push < -none else 0
+    return 1 if push * side < -none else 0
+
+
+@njit(cache=True, error_model="numpy")
+def _broken(A, lower, upper, act, x, start, work):
+    """Mark the side on which x breaks each free row; count them, and find the first on the way.
+
+    Returns the count, that row (−1: none), and how far from `start` to x it lets one go, 0 to 1.
+    """
+    slack, side = work.slack, work.side
+    count = 0
+    first = -1
+    way = 1.0
+    for i in range(len(A)):
+        side[i] = 0
+        if act[i] != 0:
+            continue
+        goal = _dot(A[i], x)
+        if goal > upper[i] + slack[i] + FEASIBLE * abs(upper[i]):
+            bound, side[i] = upper[i], 1
+        elif goal < lower[i] - slack[i] - FEASIBLE * abs(lower[i]):
+            bound, side[i] = lower[i], -1
+        else:
+            continue
+        count += 1
+        here = _dot(A[i], start)
+        ratio = max(0.0, (bound - here) / (goal - here)) if goal != here else 0.0
+        if ratio < way or first < 0:
+            way, first = ratio, i
+    return count, first, way
+
+
+@njit(cache=True, error_model="numpy")
+def _unwilling(off, act, frobenius, row_norm, length, kept, single, late, work):
+    """Mark the active rows that hold x back although a level would gain by letting go.
+
+    Returns how many, and the worst of those that the first such level names (−1: none), or where it
+    is `late` just the first. Where rows move `single`, the levels below are left out.
+    """
+    p = len(off) - 1
+    count = 0
+    worst = -1
+    w, lam, doubt, wrong = work.w, work.lam, work.doubt, work.wrong
+    _weigh(work)
+    for i in range(len(act)):  # 2: no column has decided on it yet
+        wrong[i] = 2 if (act[i] == 1 or act[i] == -1) and not kept[i] else 0
+    for k in range(p + 1):
+        _column(k, work)
+        scale = length
+        if k < p:
+            scale = frobenius[k] * np.sqrt(_dot(w[off[k] : off[k + 1]], w[off[k] : off[k + 1]]))
+        named = worst >= 0
+        most = 0.0
+        for level in range(min(k + 1, p)):
+            for i in range(off[level], off[level + 1]):
+                if wrong[i] != 2:
+                    continue
+                room = work.slack[i] + FEASIBLE * abs(work.target[i])
+                unit = row_norm[i] if k > level else 1.0
+                says = _judge(
+                    k == level, act[i], w[i], room, lam[i, k] * unit, doubt[i, k] * unit, scale
+                )
+                if says == 0:
+                    continue
+                wrong[i] = 1 if says > 0 else 0
+                if says < 0:
+                    continue
+                count += 1
+                size = abs(lam[i, k]) * unit
+                if not named and (worst < 0 or (size > most and not late)):
+                    worst, most = i, size
+        if single and worst >= 0:
+            break
+    return count, worst
 
 
 @njit(cache=True, error_model="numpy")
@@ -566,27 +649,18 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
     M, n = A.shape
     p = len(off) - 1
     work = _work(M, n, p)
-    own = np.empty(M, np.int64)
     rough = np.empty(p)
     for k in range(p):
         demanding = False  # a limit's rank is never cut
         for i in range(off[k], off[k + 1]):
-            own[i] = k
             demanding |= act[i] == 2
         if rank_tolerance < 0.0 or not demanding:
             rough[k] = max(off[k + 1] - off[k], n) * EPS * frobenius[k]
         else:
             rough[k] = rank_tolerance * frobenius[k]
+    target, side, wrong = work.target, work.side, work.wrong
     x = np.zeros(n)
-    w = np.zeros(M)
-    lam = np.zeros((M, p + 1))
-    doubt = np.empty((M, p + 1))
-    target = np.zeros(M)
-    slack = np.empty(M)
     start = np.zeros(n)  # the point that the steps of one row have reached
-    side = np.zeros(M, np.int8)  # of the bound that x breaks
-    open_ = np.empty(M, np.bool_)  # active rows that no column has decided on yet
-    wrong = np.empty(M, np.bool_)
     kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
     last = -1  # row and side let go in the step before
     last_side = 0
@@ -601,7 +675,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
         for i in range(M):
             if act[i] != 0:
                 target[i] = upper[i] if act[i] > 0 else lower[i]
-        _reduce(A, target, off, act, row_norm, frobenius, rough, dust, work, x)
+        _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x)
         length = np.sqrt(_dot(x, x))
         for k in range(p):  # where x vanishes by cancellation, what the levels ask of it counts
             s = 0.0
@@ -610,70 +684,24 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
                     s += target[i] * target[i]
             if frobenius[k] > 0.0:
                 length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
-        # Rows that x breaks, and the first of them on the way.
-        count = 0
-        alpha = 1.0
-        block = -1
         for i in range(M):
-            slack[i] = FEASIBLE * row_norm[i] * length
-            side[i] = 0
-            if act[i] != 0:
-                continue
-            goal = _dot(A[i], x)
-            if goal > upper[i] + slack[i] + FEASIBLE * abs(upper[i]):
-                bound, side[i] = upper[i], 1
-            elif goal < lower[i] - slack[i] - FEASIBLE * abs(lower[i]):
-                bound, side[i] = lower[i], -1
-            else:
-                continue
-            count += 1
-            here = _dot(A[i], start)
-            ratio = max(0.0, (bound - here) / (goal - here)) if goal != here else 0.0
-            if ratio < alpha or block < 0:
-                alpha, block = ratio, i
-        # Rows that hold x back although a level would gain by letting go; the worst of them.
+            work.slack[i] = FEASIBLE * row_norm[i] * length
+        broken, block, alpha = _broken(A, lower, upper, act, x, start, work)
+        unwilling = 0
         drop = -1
         if not single or block < 0:
-            _weigh(target, work, w)
-            for i in range(M):
-                open_[i] = act[i] != 0 and act[i] != 2 and not kept[i]
-                wrong[i] = False
-            for k in range(p + 1):
-                _column(k, work, lam, doubt)
-                scale = length
-                if k < p:
-                    s = 0.0
-                    for i in range(off[k], off[k + 1]):
-                        s += w[i] * w[i]
-                    scale = frobenius[k] * np.sqrt(s)
-                scale *= SIGNED
-                seen = drop >= 0
-                worst = 0.0
-                for i in range(off[min(k + 1, p)]):
-                    if not open_[i]:
-                        continue
-                    room = slack[i] + FEASIBLE * abs(target[i])
-                    says = _judge(
-                        k, own[i], act[i], w[i], room, lam[i, k], doubt[i, k], row_norm[i], scale
-                    )
-                    open_[i] = says == 0
-                    if says <= 0:
-                        continue
-                    wrong[i] = True
-                    count += 1
-                    size = abs(lam[i, k]) * (row_norm[i] if k > own[i] else 1.0)
-                    late = 2 * (step - begun) > pivots  # Bland: the first one, so that it ends
-                    if not seen and (drop < 0 or (size > worst and not late)):
-                        drop, worst = i, size
-                if single and drop >= 0:
-                    break
+            late = 2 * (step - begun) > pivots  # Bland: the first one, so that it ends
+            unwilling, drop = _unwilling(
+                off, act, frobenius, row_norm, length, kept, single, late, work
+            )
+        count = broken + unwilling
         if count == 0:
             break
         if not single:
             if count < fewest and step + 1 < blocks:
                 fewest = count
                 for i in range(M):
-                    if wrong[i]:
+                    if wrong[i] == 1:
                         act[i] = 0
                     elif side[i] != 0:
                         act[i] = side[i]
@@ -695,7 +723,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
             last, last_side = drop, act[drop]
             act[drop] = 0
     else:
-        _weigh(target, work, w)
+        _weigh(work)
         for k in range(p + 1):
-            _column(k, work, lam, doubt)
-    return x, lam, work.first[1:] - work.first[:-1]
+            _column(k, work)
+    return x, work.lam, work.first[1:] - work.first[:-1]

@@ -57,13 +57,13 @@ class HQP:
 
     An answer is found by the first of these ways that passes the optimality certificate:
 
-    - "shortcut": the equalities alone or the warm start's active set, settled by a few rounds of
-      exact active-set steps (left out where `shortcuts` is False);
+    - "shortcut": the equalities alone or the warm start's active set, settled by exact active-set
+      steps (left out where `shortcuts` is False);
     - the QP solver, level by level in the freedom left, its active set settled likewise;
     - "one row at a time": the exact primal method, then with bounds drawn apart, then with rows
       that are dependent to 1e-13 taken as dependent;
     - "many digits": the same method in decimal arithmetic, for levels whose rows differ in size by
-      1e10 or more. It takes seconds; some ten in 100,000 problems of benchmarks/fuzz.py need it.
+      1e10 or more. It takes a second; some ten in 100,000 problems of benchmarks/fuzz.py need it.
 
     Solution.method names the way, Solution.failed the ways before it. Where several x are optimal
     the shortest is returned.

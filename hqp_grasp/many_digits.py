@@ -2,7 +2,7 @@
 
 Rows of one level whose sizes differ by ten orders of magnitude or more leave residuals whose
 rounding hides the forces of the small rows; no tolerance tells their signs. The same method as in
-`active_set`, with enough digits, needs none. It is slow, seconds for the largest problems, and
+`active_set`, with enough digits, needs none. It is slow, a second for larger problems, and
 asked last: some ten in 100,000 problems of `benchmarks/fuzz.py` get here.
 """
 
@@ -123,59 +123,48 @@ def search(
     """Find the active set (`act`, changed in place) in at most `pivots` steps; x, lam, rank."""
     with localcontext() as context:
         context.prec = DIGITS
-        return _search(A, lower, upper, off, act, pivots)
-
-
-def _search(
-    A: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    off: np.ndarray,
-    act: np.ndarray,
-    pivots: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    M = len(A)
-    own = np.repeat(np.arange(len(off) - 1), np.diff(off))
-    exact = decimals(A)
-    size = np.array([(a @ a).sqrt() for a in exact], dtype=object)
-    low = [Decimal(float(b)) for b in lower]  # decimals know infinity
-    high = [Decimal(float(b)) for b in upper]
-    free = act != 2
-    act[free & (upper < 0.0)] = 1
-    act[free & (lower > 0.0)] = -1
-    here = np.full(M, Decimal(0), dtype=object)  # A x at the point that is reached
-    for step in range(pivots):
-        target = np.array([high[i] if act[i] > 0 else low[i] for i in range(M)], dtype=object)
-        found = _Levels(exact, target, off, act)
-        goal = exact @ found.x
-        block, side, alpha = -1, 0, Decimal(1)
-        for i in np.flatnonzero(act == 0).tolist():
-            for bound, direction in ((high[i], 1), (low[i], -1)):
-                if bound.is_infinite():
-                    continue
-                if (goal[i] - bound) * direction > NONE * size[i] * found.reach:
-                    way = goal[i] - here[i]
-                    t = max(Decimal(0), (bound - here[i]) / way) if way else Decimal(0)
-                    if block < 0 or t < alpha:
-                        block, side, alpha = i, direction, t
-        if block >= 0:
-            here = here + alpha * (goal - here)
-            act[block] = side
-            continue
-        here = goal
-        drop, worst = -1, (len(off), Decimal(0))
-        for i in np.flatnonzero(np.abs(act) == 1).tolist():
-            pushes = [(own[i], found.w[i] * int(act[i]), Decimal(0))]
-            for k in range(own[i] + 1, len(off)):
-                pushes.append((k, found.lam[i, k] * int(act[i]), found.doubt[i, k]))
-            for k, push, doubt in pushes:
-                if abs(push) > doubt:
-                    if push < 0 and (drop < 0 or (k, push * size[i]) < worst):
-                        drop, worst = i, (k, push * size[i])
+        M = len(A)
+        own = np.repeat(np.arange(len(off) - 1), np.diff(off))
+        exact = decimals(A)
+        size = np.array([(a @ a).sqrt() for a in exact], dtype=object)
+        low = [Decimal(float(b)) for b in lower]  # decimals know infinity
+        high = [Decimal(float(b)) for b in upper]
+        free = act != 2
+        act[free & (upper < 0.0)] = 1
+        act[free & (lower > 0.0)] = -1
+        here = np.full(M, Decimal(0), dtype=object)  # A x at the point that is reached
+        for step in range(pivots):
+            target = np.array([high[i] if act[i] > 0 else low[i] for i in range(M)], dtype=object)
+            found = _Levels(exact, target, off, act)
+            goal = exact @ found.x
+            block, side, alpha = -1, 0, Decimal(1)
+            for i in np.flatnonzero(act == 0).tolist():
+                for bound, direction in ((high[i], 1), (low[i], -1)):
+                    if bound.is_infinite():
+                        continue
+                    if (goal[i] - bound) * direction > NONE * size[i] * found.reach:
+                        way = goal[i] - here[i]
+                        t = max(Decimal(0), (bound - here[i]) / way) if way else Decimal(0)
+                        if block < 0 or t < alpha:
+                            block, side, alpha = i, direction, t
+            if block >= 0:
+                here = here + alpha * (goal - here)
+                act[block] = side
+                continue
+            here = goal
+            drop, worst = -1, (len(off), Decimal(0))
+            for i in np.flatnonzero(np.abs(act) == 1).tolist():
+                pushes = [(own[i], found.w[i] * int(act[i]), Decimal(0))]
+                for k in range(own[i] + 1, len(off)):
+                    pushes.append((k, found.lam[i, k] * int(act[i]), found.doubt[i, k]))
+                for k, push, doubt in pushes:
+                    if abs(push) > doubt:
+                        if push < 0 and (drop < 0 or (k, push * size[i]) < worst):
+                            drop, worst = i, (k, push * size[i])
+                        break
+                if drop >= 0 and 2 * step > pivots:  # Bland: the first one, so that it ends
                     break
-            if drop >= 0 and 2 * step > pivots:  # Bland: the first one, so that it ends
+            if drop < 0:
                 break
-        if drop < 0:
-            break
-        act[drop] = 0
-    return found.x.astype(float), found.lam.astype(float), found.rank
+            act[drop] = 0
+        return found.x.astype(float), found.lam.astype(float), found.rank

@@ -6,9 +6,12 @@ the joints, q̇_c the secondary step, ⁺ the pseudo-inverse, * the SR-inverse.
 
 import numpy as np
 import pytest
+from hqp_grasp.scenarios import cylinder
 from problems import Rows, box, equal
 
+import hqp_grasp as hg
 from hqp_grasp import HQP, Level, Projection
+from hqp_grasp.trial import SR_DAMPING, TOUCH_RANK, clip_to_limits
 
 # Two routes to one answer in double precision: 1e-16 times a condition number, which the problems
 # here keep below 1e4, squared at worst (an SR-inverse forms JJᵀ). Asked for is 1e-8.
@@ -288,3 +291,52 @@ def test_no_clipped_projection_meets_the_first_level_better_than_the_hierarchy(s
             better += ours < theirs - 0.01
         assert np.abs(answer.x).max() <= 0.25 + TOL
     assert better > 60
+
+
+# ---------------------------------------------------------------- on grasps felt
+
+
+@pytest.fixture(scope="module")
+def probe():
+    return hg.GeometricProbe(cylinder.scene)
+
+
+def serves_at_least_as_well(levels, x, other):
+    """True where x misses the first level that tells them apart by less than `other` does."""
+    for level in levels:
+        ours, theirs = (np.linalg.norm(level.residual(step)) for step in (x, other))
+        if abs(ours - theirs) > TOL:
+            return ours < theirs
+    return True
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    ("cap", "tight"),
+    [(hg.StepLimit(1.5, 0.3), False), (hg.StepLimit(0.1, 0.01), True)],
+    ids=["wide", "tight"],
+)
+def test_on_grasps_felt_the_forms_agree_unless_a_limit_holds_and_then_none_is_better(
+    cap, tight, solver, probe
+):
+    hqp = HQP(solver, rank_tolerance=TOUCH_RANK, shortcuts=False)
+    ranges = hg.ConfigurationLimit(cylinder.scene.articulated)
+    stack = hg.Stack.from_letters("fmk").within(cap, ranges)
+    agreed = held = 0
+    for seed in range(2):
+        for grasp in hg.Trial(cylinder.scene, stack, probes=8).run(seed, probe).grasps:
+            levels, laws = stack.levels(grasp), stack.law_levels(grasp)
+            solution = hqp.solve(levels)
+            assert solution.is_optimal(levels)
+            strict = Projection(rank_tolerance=TOUCH_RANK).solve(laws).x
+            if solution.limit_active:
+                held += 1
+                for x in (strict, Projection(damping=SR_DAMPING).solve(laws).x):
+                    clipped = clip_to_limits(x, stack, grasp)
+                    assert serves_at_least_as_well(levels, solution.x, clipped)
+            else:
+                agreed += 1
+                away = solution.x - strict
+                assert np.abs(away).max() < TOL
+                assert max(np.abs(level.A @ away).max() for level in laws) < TOL
+    assert held > agreed if tight else agreed > held
