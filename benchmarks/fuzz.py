@@ -29,7 +29,7 @@ from hqp_grasp import HQP, InputError, Level
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import OracleError, lexicographic_optimum
-from problems import Rows, general, near_singular, three_level
+from problems import Rows, general, near_singular_at_any_angle, three_level
 
 CHUNK = 50  # problems handed to a worker at once
 SHOWN = 40  # failures listed at most
@@ -80,8 +80,7 @@ def make(kind: str, seed: int, index: int) -> list[Rows]:
     if kind == "general":
         return general(rng)
     if kind == "near_singular":
-        angle = 10.0 ** -rng.uniform(1.0, 16.0)
-        return near_singular(rng, angle, *(rng.random(2) < 0.5))
+        return near_singular_at_any_angle(rng)
     return three_level(rng, kind.removeprefix("three_level-"))
 
 

@@ -321,7 +321,7 @@ def draw_growth(growth: dict[str, dict[int, dict[str, Seen]]], path: Path) -> No
     axes[0].legend(fontsize=8)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=100)
     print(f"\nfigure  {path}")
 
 

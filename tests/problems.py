@@ -64,6 +64,12 @@ def near_singular(rng, angle, limits=True, agree=False):
     return [box(n, 0.25), *levels] if limits else levels
 
 
+def near_singular_at_any_angle(rng):
+    """Angles from 1e-1 to 1e-16, with and without limits, with levels that agree and that do not."""
+    angle = 10.0 ** -rng.uniform(1.0, 16.0)
+    return near_singular(rng, angle, *(rng.random(2) < 0.5))
+
+
 def scaling(rng, n, levels):
     """A box, levels − 2 Gaussian tasks that together take three quarters of n, and a posture."""
     tasks = max(levels - 2, 0)

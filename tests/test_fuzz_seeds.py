@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from oracle import lexicographic_optimum
-from problems import general
+from problems import general, near_singular_at_any_angle
 
 from hqp_grasp import HQP, Level
 
@@ -23,9 +23,12 @@ UNSOLVED = [
 NOT_LEAST = [(5, i) for i in (15, 135, 194, 233, 341, 386)]
 
 
-def problem(seed, index):
-    rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
-    return general(rng)
+# Of `near_singular` problems: multipliers of 1e15, which no double can balance to 1e-8.
+BEYOND_DOUBLES = [(1, 3496), (1, 4073), (2, 2534), (3, 4143), (3, 4807)]
+
+
+def problem(seed, index, draw=general):
+    return draw(np.random.default_rng(np.random.SeedSequence([seed, index])))
 
 
 @pytest.mark.parametrize(("seed", "index"), UNSOLVED)
@@ -53,3 +56,9 @@ def test_many_digits_find_what_double_precision_cannot():
     answer = HQP().solve(levels)
     assert answer.method == "many digits"
     assert answer.is_optimal(levels)
+
+
+@pytest.mark.parametrize(("seed", "index"), BEYOND_DOUBLES)
+def test_levels_parallel_to_the_last_digits_are_answered_and_certified(seed, index):
+    levels = [Level(*rows) for rows in problem(seed, index, near_singular_at_any_angle)]
+    assert HQP().solve(levels).is_optimal(levels)
