@@ -65,7 +65,7 @@ def near_singular(rng, angle, limits=True, agree=False):
 
 
 def near_singular_at_any_angle(rng):
-    """Angles from 1e-1 to 1e-16, with and without limits, with levels that agree and that do not."""
+    """Angles from 1e-1 to 1e-16, with limits or not, with levels that agree or not."""
     angle = 10.0 ** -rng.uniform(1.0, 16.0)
     return near_singular(rng, angle, *(rng.random(2) < 0.5))
 
