@@ -19,6 +19,7 @@ VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judg
 SIGN_PASSES = 8  # rounds of mending signs before the least-squares search is asked
 SMALL = 1e-11  # [–] of the largest pull: what is left of it on another unknown by rounding
 DIGITS = 80
+WEAK = 1e-3  # [–] of a row: with less of its own it makes the span uncertain
 LEAN = 1e8  # [–] a level's proof is not added to another's more often than this
 ROUNDING = 1e-13  # [–] of the terms that make up an imbalance; below it, it counts as none,
 # unless they are huge: next to them any pull is small, and by such terms it could be balanced
@@ -54,9 +55,9 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     p must prove that x is the shortest optimum. Returns whether none fails; w (M,) with residuals
     of the size of rounding set to 0, and missed (p,), the levels with others; pull (M,) the
     residuals as they are, since a small one of a large row may balance the others; push (M,) 0
-    where a row may not push, 1 upwards, −1 downwards, 2 both; imbalance (n, columns) and scale
-    (n, columns): what is left of each level's pull on each unknown, and how much of that counts as
-    none: what its own rows' rooms would make up for.
+    where a row may not push, 1 upwards, −1 downwards, 2 both; proven (columns,), which do not fail;
+    and scale (n, columns): how much of a level's pull may be left on each unknown: what its own
+    rows' rooms would make up for.
     """
     M, n = A.shape
     p = len(off) - 1
@@ -70,7 +71,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     for j in range(n):
         length += x[j] * x[j]
     length = np.sqrt(length)
-    proven = np.isfinite(length)
+    finite = np.isfinite(length)
     for k in range(p):
         asked = 0.0
         for i in range(off[k], off[k + 1]):
@@ -119,6 +120,8 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
         forces[i, own[i]] = pull[i]
         for k in range(own[i] + 1, columns):
             forces[i, k] = lam[i, k]
+    proven = np.empty(columns, np.bool_)
+    every = True
     imbalance = np.empty((n, columns))
     terms = np.empty(n)  # sums of the sizes of what makes it up
     for k in range(columns):
@@ -153,15 +156,19 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
             imbalance[j, k] = s
             pulls = max(pulls, abs(s))
         for j in range(n):
-            s = imbalance[j, k]
             for i in range(off[min(k, p)]):
-                s += A[i, j] * forces[i, k]
+                imbalance[j, k] += A[i, j] * forces[i, k]
                 terms[j] += abs(A[i, j] * forces[i, k])
-            imbalance[j, k] = s
-            small = min(scale[j, k], ROUNDING * terms[j])
-            scale[j, k] += max(small, min(EVALUATED * terms[j], LOST * pulls))
-            proven &= abs(s) <= scale[j, k]
-    return proven, w, missed, pull, push, imbalance, scale
+        widest = 0.0  # a force's error reaches other unknowns too
+        for j in range(n):
+            widest = max(widest, terms[j])
+        huge = min(EVALUATED * widest, LOST * pulls)
+        proven[k] = finite
+        for j in range(n):
+            scale[j, k] += min(scale[j, k], ROUNDING * terms[j])
+            proven[k] &= abs(imbalance[j, k]) <= max(scale[j, k], huge)
+        every &= proven[k]
+    return every, w, missed, pull, push, proven, scale
 
 
 def optimality_faults(
@@ -174,20 +181,20 @@ def optimality_faults(
     tol: float,
     left: float = 0.0,
     least_norm: bool = False,
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
+) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
     """Residuals w (M,), levels that have some (p,), and what keeps x from being certified.
 
-    The list is empty where nothing does.
+    That is said for each level at fault, and for p where x is not shown to be the shortest.
     """
-    proven, w, missed, pull, push, imbalance, scale = check(
+    every, w, missed, pull, push, proven, scale = check(
         A, lower, upper, off, x, multipliers, tol, left, least_norm
     )
-    faults: list[str] = []
-    if proven:
+    faults: dict[int, str] = {}
+    if every:
         return w, missed, faults
     if not np.isfinite(x).all():
-        return w, missed, ["x is not finite"]
-    for k in np.flatnonzero(~(np.abs(imbalance) <= scale).all(axis=0)):
+        return w, missed, {0: "x is not finite"}
+    for k in np.flatnonzero(~proven):
         last = k == len(off) - 1
         above = slice(0, off[k])
         own = slice(off[k], off[k + 1]) if not last else slice(0, 0)
@@ -195,7 +202,7 @@ def optimality_faults(
         rest = _least_imbalance(force, A[above], push[above], scale[:, k])
         if not rest <= 1.0:
             name = "least norm of x" if last else f"level {k}"
-            faults.append(f"{name}: imbalance is {rest:.1e} of what counts as none")
+            faults[int(k)] = f"{name}: imbalance is {rest:.1e} of what counts as none"
     return w, missed, faults
 
 
@@ -211,12 +218,13 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: n
     size = np.maximum(scale, SMALL * np.abs(pull).max())
     free, signed = A[push == 2], np.concatenate([A[push == 1], -A[push == -1]])
     for without in (_without, _without_in_many_digits):
-        rest, rows = without(free, pull, signed, size)
+        rest, rows, weakest = without(free, pull, signed, size)
         length = float(np.linalg.norm(rest))
         if length > 0.0 and len(rows):
             best, _ = nnls(rows.T, -rest / length, maxiter=30 * (1 + len(rows)))
             rest = rest + length * (rows.T @ best)
-        imbalance = float(np.abs(rest).max())
+        lost = min(LOST, EVALUATED / max(weakest, EPS)) * np.abs(pull / size).max()
+        imbalance = float(np.abs(rest).max()) / max(1.0, lost)
         if imbalance <= 1.0:
             break
     return imbalance
@@ -224,8 +232,11 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: n
 
 def _without(
     free: np.ndarray, pull: np.ndarray, signed: np.ndarray, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """pull / size and the directions of signed / size without what lies in span(free / size)."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """pull / size and the directions of signed / size without what lies in span(free / size).
+
+    And a bound on how weak the weakest combination of the free rows is, each of length 1.
+    """
     rest, rows = pull / size, _directions(signed / size)
     free = _directions(free / size)
     if len(free):
@@ -234,12 +245,12 @@ def _without(
         for _ in range(2):
             rest = rest - basis.T @ (basis @ rest)
             rows = rows - (rows @ basis.T) @ basis
-    return rest, rows
+    return rest, rows, 1.0
 
 
 def _without_in_many_digits(
     free: np.ndarray, pull: np.ndarray, signed: np.ndarray, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, float]:
     """The same as `_without`, by Gram–Schmidt on decimals."""
     with localcontext() as context:
         context.prec = DIGITS
@@ -250,6 +261,7 @@ def _without_in_many_digits(
             for row in group:
                 row /= (row @ row).sqrt() or 1
         basis: list[np.ndarray] = []
+        weakest = 1.0
         for q in left:  # in the order of the levels, as ranks are told
             for _ in range(2):
                 for known in basis:
@@ -258,9 +270,10 @@ def _without_in_many_digits(
             if norm > EPS * len(basis):
                 q = q / norm
                 basis.append(q)
+                weakest *= float(norm) if norm < WEAK else 1.0
                 rest = rest - (rest @ q) * q
                 rows = rows - np.outer(rows @ q, q)
-        return rest.astype(float), rows.astype(float)
+        return rest.astype(float), rows.astype(float), weakest
 
 
 def _directions(rows: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import daqp
@@ -52,6 +52,14 @@ def solvers() -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
+class _Tried:
+    """What became of the ways that led to no answer."""
+
+    failed: list[str]
+    spare: list[Solution]  # optimal at every level, and not shown to be the shortest such
+
+
+@dataclass(frozen=True)
 class HQP:
     """Strict lexicographic least squares: each level as nearly as those above allow.
 
@@ -66,7 +74,8 @@ class HQP:
       1e10 or more. It takes a second; some ten in 100,000 problems of benchmarks/fuzz.py need it.
 
     Solution.method names the way, Solution.failed the ways before it. Where several x are optimal
-    the shortest is returned.
+    the shortest is returned. Where no way before the last can show which that is, because rows
+    depend on one another up to the last digits, it is the shortest found, and `failed` says so.
     """
 
     solver: str = "proxqp"  # one of solvers()
@@ -88,7 +97,7 @@ class HQP:
         rows = stack(levels)
         norms = measure(rows.A, rows.offsets)
         equalities = active_set.equalities(rows.lower, rows.upper)
-        failed: list[str] = []
+        tried = _Tried([], [])
         if self.shortcuts:
             act = equalities.copy()
             if warm is not None and len(warm.active) == len(act):
@@ -96,7 +105,7 @@ class HQP:
                 act[held & (act == 0)] = warm.active[held & (act == 0)]
                 _possible(act, rows)
             found = self._settle(
-                levels, rows, norms, act, "shortcut", failed, QUICK_ROUNDS, QUICK_PIVOTS
+                levels, rows, norms, act, "shortcut", tried, QUICK_ROUNDS, QUICK_PIVOTS
             )
             if found is not None:
                 return found
@@ -104,10 +113,10 @@ class HQP:
             backend = OWN_INTERFACE.get(self.solver) or _through_qpsolvers(self.solver)
             act = _cascade(rows, norms, backend)
         except _BackendError as failure:
-            failed.append(f"{self.solver}: {failure}")
+            tried.failed.append(f"{self.solver}: {failure}")
         else:
             found = self._settle(
-                levels, rows, norms, act, self.solver, failed, POLISH_ROUNDS, QUICK_PIVOTS
+                levels, rows, norms, act, self.solver, tried, POLISH_ROUNDS, QUICK_PIVOTS
             )
             if found is not None:
                 return found
@@ -118,20 +127,23 @@ class HQP:
                 _loosened_active_set(rows, norms, act, draw, dust)
             budget = (POLISH_ROUNDS, QUICK_PIVOTS) if draw else (0, steps)
             found = self._settle(
-                levels, rows, norms, act, "one row at a time", failed, *budget, dust
+                levels, rows, norms, act, "one row at a time", tried, *budget, dust
             )
             if found is not None:
                 return found
+        if tried.spare:
+            shortest = min(tried.spare, key=lambda answer: float(np.linalg.norm(answer.x)))
+            return replace(shortest, failed=tuple(tried.failed))
         act = equalities.copy()
         try:
             answer = many_digits.search(rows.A, rows.lower, rows.upper, rows.offsets, act, steps)
         except ArithmeticError as error:
-            failed.append(f"many digits: {error!r}")
+            tried.failed.append(f"many digits: {error!r}")
         else:
-            found = self._certified(levels, rows, act, *answer, "many digits", failed)
+            found = self._certified(levels, rows, act, *answer, "many digits", tried)
             if found is not None:
                 return found
-        raise SolverError("no way led to a certified optimum: " + "; ".join(failed))
+        raise SolverError("no way led to a certified optimum: " + "; ".join(tried.failed))
 
     def damped(
         self,
@@ -181,12 +193,12 @@ class HQP:
         norms: tuple[np.ndarray, np.ndarray],
         act: np.ndarray,
         method: str,
-        failed: list[str],
+        tried: _Tried,
         rounds: int,
         pivots: int,
         dust: float = active_set.DUST,
     ) -> Solution | None:
-        """Settle the active set and certify; None, with the reason in `failed`, where it fails."""
+        """Settle the active set and certify; None, with the reason in `tried`, where it fails."""
         row_norm, frobenius = norms
         x, multipliers, rank = active_set.search(
             rows.A,
@@ -201,7 +213,7 @@ class HQP:
             rounds,
             pivots,
         )
-        return self._certified(levels, rows, act, x, multipliers, rank, method, failed)
+        return self._certified(levels, rows, act, x, multipliers, rank, method, tried)
 
     def _certified(
         self,
@@ -212,9 +224,9 @@ class HQP:
         multipliers: np.ndarray,
         rank: np.ndarray,
         method: str,
-        failed: list[str],
+        tried: _Tried,
     ) -> Solution | None:
-        """The answer, where it passes its certificate; None, with the reason in `failed`."""
+        """The answer, where it passes its certificate; None, with the reason in `tried`."""
         left = self.rank_tolerance or 0.0
         residual, missed, faults = optimality_faults(
             rows.A,
@@ -228,8 +240,9 @@ class HQP:
             True,
         )
         if faults:
-            failed.append(f"{method}: {faults[0]}")
-            return None
+            tried.failed.append(f"{method}: {next(iter(faults.values()))}")
+            if list(faults) != [len(levels)]:
+                return None
         off = rows.offsets.tolist()
         reports = [
             LevelReport(level.name, residual[begin:end], r, "nearest" if miss else "met")
@@ -237,7 +250,11 @@ class HQP:
                 levels, off, off[1:], rank.tolist(), missed.tolist(), strict=False
             )
         ]
-        return Solution(x, tuple(reports), act, multipliers, method, tuple(failed), left)
+        answer = Solution(x, tuple(reports), act, multipliers, method, tuple(tried.failed), left)
+        if faults:
+            tried.spare.append(answer)
+            return None
+        return answer
 
 
 def _numbers(value: object) -> np.ndarray:
