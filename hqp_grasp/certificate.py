@@ -147,12 +147,17 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
             if not mended:
                 break
         pulls = 0.0  # the level's own, to be balanced
+        dust = 0.0  # entries that small are below the rank of their level
+        if k < p:
+            dust = max(n, off[k + 1] - off[k]) * EPS * frobenius[k]
         for j in range(n):
             s = x[j] if k == p else 0.0
             terms[j] = 0.0
             for i in range(off[min(k, p)], off[min(k + 1, p)]):
                 s += A[i, j] * forces[i, k]
                 terms[j] += abs(A[i, j] * forces[i, k])
+                if abs(A[i, j]) <= dust:
+                    scale[j, k] += abs(A[i, j] * forces[i, k])
             imbalance[j, k] = s
             pulls = max(pulls, abs(s))
         for j in range(n):

@@ -7,7 +7,7 @@ from problems import Rows, box, equal, general, near_singular, scaling, three_le
 from test_oracle import HAND
 
 import hqp_grasp
-from hqp_grasp import HQP, InputError, Level, Solution
+from hqp_grasp import HQP, InputError, Level, Solution, certificate
 from hqp_grasp import hqp as hqp_module
 from hqp_grasp.hqp import solvers
 
@@ -548,6 +548,27 @@ def test_the_rank_tolerance_decides_what_counts_as_independent():
     assert [level.rank for level in truncated.levels] == [3, 0, 8]
     assert np.linalg.norm(strict.x) > 1e3 > np.linalg.norm(truncated.x)
     assert strict.levels[1].status == "met" and truncated.levels[1].status == "nearest"
+
+
+def test_rows_that_differ_in_the_last_digit_and_contradict_each_other_share_the_miss():
+    """The second row knows x₂ … x₇ by 1e-16 only: below the rank of its level."""
+    noise = 1e-16 * np.random.default_rng(0).standard_normal(7)
+    answer = solve([equal([np.eye(7)[0], np.eye(7)[0] + noise], [1.0, -1.0])])
+    assert_same_point(answer.x, np.zeros(7))
+    assert answer.levels[0].rank == 1
+
+
+def test_an_answer_that_is_not_shown_to_be_the_shortest_is_not_withheld(monkeypatch):
+    def never_the_shortest(*arguments):
+        residual, missed, faults = certificate.optimality_faults(*arguments)
+        return residual, missed, {**faults, len(missed): "least norm of x: not shown"}
+
+    monkeypatch.setattr(hqp_module, "optimality_faults", never_the_shortest)
+    levels = built([box(3, 1.0), equal([[1.0, 1.0, 1.0]], [1.5])])
+    answer = HQP().solve(levels)
+    assert answer.is_optimal(levels)
+    assert_same_point(answer.x, [0.5, 0.5, 0.5])
+    assert all("least norm" in fault for fault in answer.failed) and answer.failed
 
 
 def test_levels_exactly_parallel_are_one_level_and_a_miss():
