@@ -226,7 +226,10 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: n
         rest, rows, weakest = without(free, pull, signed, size)
         length = float(np.linalg.norm(rest))
         if length > 0.0 and len(rows):
-            best, _ = nnls(rows.T, -rest / length, maxiter=30 * (1 + len(rows)))
+            try:
+                best, _ = nnls(rows.T, -rest / length, maxiter=30 * (1 + len(rows)))
+            except RuntimeError:  # it did not converge: these rows are not shown to balance
+                best = np.zeros(len(rows))
             rest = rest + length * (rows.T @ best)
         lost = min(LOST, EVALUATED / max(weakest, EPS)) * np.abs(pull / size).max()
         imbalance = float(np.abs(rest).max()) / max(1.0, lost)
@@ -240,7 +243,7 @@ def _without(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """pull / size and the directions of signed / size without what lies in span(free / size).
 
-    And a bound on how weak the weakest combination of the free rows is, each of length 1.
+    And how weak the weakest combination of the free rows is, each of length 1; 1 if not looked for.
     """
     rest, rows = pull / size, _directions(signed / size)
     free = _directions(free / size)

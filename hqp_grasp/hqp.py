@@ -74,8 +74,8 @@ class HQP:
       1e10 or more. It takes a second; some ten in 100,000 problems of benchmarks/fuzz.py need it.
 
     Solution.method names the way, Solution.failed the ways before it. Where several x are optimal
-    the shortest is returned. Where no way before the last can show which that is, because rows
-    depend on one another up to the last digits, it is the shortest found, and `failed` says so.
+    the shortest is returned. Where it cannot be shown which that is, because rows depend on one
+    another up to the last digits, it is the shortest found, and `failed` says so.
     """
 
     solver: str = "proxqp"  # one of solvers()
@@ -131,18 +131,19 @@ class HQP:
             )
             if found is not None:
                 return found
+        if not tried.spare:
+            act = equalities.copy()
+            try:
+                exact = many_digits.search(rows.A, rows.lower, rows.upper, rows.offsets, act, steps)
+            except ArithmeticError as error:
+                tried.failed.append(f"many digits: {error!r}")
+            else:
+                found = self._certified(levels, rows, act, *exact, "many digits", tried)
+                if found is not None:
+                    return found
         if tried.spare:
-            shortest = min(tried.spare, key=lambda answer: float(np.linalg.norm(answer.x)))
+            shortest = min(tried.spare, key=lambda spare: float(np.linalg.norm(spare.x)))
             return replace(shortest, failed=tuple(tried.failed))
-        act = equalities.copy()
-        try:
-            answer = many_digits.search(rows.A, rows.lower, rows.upper, rows.offsets, act, steps)
-        except ArithmeticError as error:
-            tried.failed.append(f"many digits: {error!r}")
-        else:
-            found = self._certified(levels, rows, act, *answer, "many digits", tried)
-            if found is not None:
-                return found
         raise SolverError("no way led to a certified optimum: " + "; ".join(tried.failed))
 
     def damped(
