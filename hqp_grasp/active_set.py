@@ -7,8 +7,9 @@ all levels are stacked; `act` says how each takes part: 2 equality, +1 held at i
 Each level is reduced in the freedom left by those above: rows are picked by the largest remaining
 norm and turned by Householder reflections from the right (Golub & Van Loan, ch. 5), so that
 A_k Q = [… L_k 0] with L_k (m, r). A row with one entry left, such as a bound of one unknown, needs
-no reflection: its column changes place. Where a pivot comes close to the rank tolerance, a
-one-sided Jacobi SVD of L_k decides the rank on singular values, as the convention asks.
+no reflection: its column changes place; first levels that hold nothing but such rows, as box
+limits do, are not turned at all. Where a pivot comes close to the rank tolerance, a one-sided
+Jacobi SVD of L_k decides the rank on singular values, as the convention asks.
 
 `search` allocates one Work and fills it anew in every step: `_reduce` finds x, `_weigh` the
 residuals, and `_column` the multipliers of one level, which only points worth judging need.
@@ -171,6 +172,8 @@ class Work(NamedTuple):
     H: np.ndarray  # (M, n) the reflector made from each picked row,
     beta: np.ndarray  # (M,) its factor, 0 where the row only moved a column
     column: np.ndarray  # (M,) from here
+    order: np.ndarray  # (n,) the unknowns, as the columns of W have them before any turn,
+    place: np.ndarray  # (n,) and where each stands
     T: np.ndarray  # (M, n) thin orthogonal factors of the L_k that are not triangular
     R: np.ndarray  # (n, n) and their triangular ones
     xq: np.ndarray  # (n,) Qᵀ x
@@ -207,6 +210,8 @@ def _work(M, n, p):
         H=np.empty((M, n)),
         beta=np.empty(M),
         column=np.empty(M, np.int64),
+        order=np.empty(n, np.int64),
+        place=np.empty(n, np.int64),
         T=np.empty((M, n)),
         R=np.empty((n, n)),
         xq=np.empty(n),
@@ -226,6 +231,44 @@ def _work(M, n, p):
         y=np.empty(n),
         z=np.empty(n),
     )
+
+
+@njit(cache=True, error_model="numpy")
+def _only_entries(A):
+    """The one unknown that each row is about, (M,); −1 where there are several, or none."""
+    M, n = A.shape
+    only = np.full(M, -1)
+    for i in range(M):
+        for j in range(n):
+            if A[i, j] != 0.0:
+                if only[i] >= 0:
+                    only[i] = -1
+                    break
+                only[i] = j
+    return only
+
+
+@njit(cache=True, error_model="numpy")
+def _line_up(A, only, rough, work):
+    """Let the unknowns stand first that the first levels hold by rows of one entry, in their order.
+
+    Such rows need no pick and no turn. Returns how many levels have no others.
+    """
+    rows, order, place = work.rows, work.order, work.place
+    for j in range(len(order)):
+        order[j] = j
+        place[j] = j
+    c = 0
+    for k in range(len(rough)):
+        for i in range(work.start[k], work.start[k + 1]):
+            j = only[rows[i]]
+            if j < 0 or place[j] < c or abs(A[rows[i], j]) <= rough[k] * CLEAR:
+                return k
+            there, other = place[j], order[c]
+            order[c], order[there] = j, other
+            place[j], place[other] = c, there
+            c += 1
+    return len(rough)
 
 
 @njit(cache=True, error_model="numpy")
@@ -345,7 +388,7 @@ def _least_squares(work, lo, hi, c, r):
 
 
 @njit(cache=True, error_model="numpy")
-def _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x):
+def _reduce(A, off, act, only, row_norm, frobenius, rough, dust, work, x):
     """Lexicographic least squares of the rows with act ≠ 0, as equalities at their target: x.
 
     What is left of a row, after it is reduced by c others, counts as nothing below `dust` × c of
@@ -353,18 +396,20 @@ def _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x):
     """
     n = A.shape[1]
     p = len(off) - 1
-    W, xq, rows, rhs = work.W, work.xq, work.rows, work.rhs
+    W, xq, rows, rhs, order = work.W, work.xq, work.rows, work.rhs, work.order
     ma = 0
     for k in range(p):
         work.start[k] = ma
         for i in range(off[k], off[k + 1]):
             if act[i] != 0:
                 rows[ma] = i
-                for j in range(n):
-                    W[ma, j] = A[i, j]
                 work.length[ma] = row_norm[i]
                 ma += 1
     work.start[p] = ma
+    lined_up = _line_up(A, only, rough, work)
+    for i in range(ma):
+        for j in range(n):
+            W[i, j] = A[rows[i], order[j]]
     c = 0
     for k in range(p):
         work.first[k] = c
@@ -373,7 +418,9 @@ def _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x):
         r = 0
         work.made[k] = 0
         work.turned[k] = False
-        if m > 0 and c < n and frobenius[k] > 0.0:
+        if k < lined_up:
+            r = work.made[k] = m
+        elif m > 0 and c < n and frobenius[k] > 0.0:
             r, ambiguous = _pick(work, lo, hi, ma, c, min(m, n - c), dust, rough[k])
             work.made[k] = r
             if ambiguous:
@@ -404,7 +451,7 @@ def _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x):
     work.first[p] = c
     for j in range(n):
         x[j] = xq[j] if j < c else 0.0
-    for k in range(p - 1, -1, -1):  # x = Q xq, the factors of Q from the last to the first
+    for k in range(p - 1, lined_up - 1, -1):  # x = Q xq, the factors of Q, the last first
         a, r = work.first[k], work.made[k]
         if work.turned[k]:
             for i in range(r):
@@ -423,6 +470,9 @@ def _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x):
                 continue
             s = work.beta[row] * _dot(work.H[row, d:], x[d:])
             _subtract(x[d:], s, work.H[row, d:])
+    for j in range(n):
+        work.y[order[j]] = x[j]
+    x[:] = work.y
 
 
 @njit(cache=True, error_model="numpy")
@@ -658,6 +708,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
             rough[k] = max(off[k + 1] - off[k], n) * EPS * frobenius[k]
         else:
             rough[k] = rank_tolerance * frobenius[k]
+    only = _only_entries(A)
     target, side, wrong = work.target, work.side, work.wrong
     x = np.zeros(n)
     start = np.zeros(n)  # the point that the steps of one row have reached
@@ -675,7 +726,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
         for i in range(M):
             if act[i] != 0:
                 target[i] = upper[i] if act[i] > 0 else lower[i]
-        _reduce(A, off, act, row_norm, frobenius, rough, dust, work, x)
+        _reduce(A, off, act, only, row_norm, frobenius, rough, dust, work, x)
         length = np.sqrt(_dot(x, x))
         for k in range(p):  # where x vanishes by cancellation, what the levels ask of it counts
             s = 0.0

@@ -25,9 +25,8 @@ from hqp_grasp.level import (
 )
 
 QUICK_ROUNDS = 10  # rounds at most of the active-set search before it moves one row at a time,
-QUICK_PIVOTS = 100  # and steps of that before another way is tried
-POLISH_ROUNDS = 20  # the same, to settle the active set that a backend names
-PIVOTS_PER_ROW = 6  # steps allowed to the one-row-at-a-time method at last
+POLISH_ROUNDS = 20  # the same, to settle an active set that something else has named
+PIVOTS = 6  # steps of one row, for each row and unknown, before another way is tried
 DRAWS = 2  # times that bounds are drawn apart
 COARSE = 1e-13  # [–] of a row: at last, rows dependent to this are taken as dependent
 LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
@@ -104,9 +103,7 @@ class HQP:
                 held = np.abs(warm.active) == 1
                 act[held & (act == 0)] = warm.active[held & (act == 0)]
                 _possible(act, rows)
-            found = self._settle(
-                levels, rows, norms, act, "shortcut", tried, QUICK_ROUNDS, QUICK_PIVOTS
-            )
+            found = self._settle(levels, rows, norms, act, "shortcut", tried, QUICK_ROUNDS)
             if found is not None:
                 return found
         try:
@@ -115,26 +112,23 @@ class HQP:
         except _BackendError as failure:
             tried.failed.append(f"{self.solver}: {failure}")
         else:
-            found = self._settle(
-                levels, rows, norms, act, self.solver, tried, POLISH_ROUNDS, QUICK_PIVOTS
-            )
+            found = self._settle(levels, rows, norms, act, self.solver, tried, POLISH_ROUNDS)
             if found is not None:
                 return found
-        steps = PIVOTS_PER_ROW * sum(rows.A.shape)
         for dust, draw in product((active_set.DUST, COARSE), range(1 + DRAWS)):
             act = equalities.copy()
             if draw:
                 _loosened_active_set(rows, norms, act, draw, dust)
-            budget = (POLISH_ROUNDS, QUICK_PIVOTS) if draw else (0, steps)
-            found = self._settle(
-                levels, rows, norms, act, "one row at a time", tried, *budget, dust
-            )
+            rounds = POLISH_ROUNDS if draw else 0
+            found = self._settle(levels, rows, norms, act, "one row at a time", tried, rounds, dust)
             if found is not None:
                 return found
         if not tried.spare:
             act = equalities.copy()
             try:
-                exact = many_digits.search(rows.A, rows.lower, rows.upper, rows.offsets, act, steps)
+                exact = many_digits.search(
+                    rows.A, rows.lower, rows.upper, rows.offsets, act, _pivots(rows)
+                )
             except ArithmeticError as error:
                 tried.failed.append(f"many digits: {error!r}")
             else:
@@ -196,7 +190,6 @@ class HQP:
         method: str,
         tried: _Tried,
         rounds: int,
-        pivots: int,
         dust: float = active_set.DUST,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `tried`, where it fails."""
@@ -212,7 +205,7 @@ class HQP:
             -1.0 if self.rank_tolerance is None else self.rank_tolerance,
             dust,
             rounds,
-            pivots,
+            _pivots(rows),
         )
         return self._certified(levels, rows, act, x, multipliers, rank, method, tried)
 
@@ -258,6 +251,11 @@ class HQP:
         return answer
 
 
+def _pivots(rows: Stacked) -> int:
+    """Steps of one row that a search may take."""
+    return PIVOTS * sum(rows.A.shape)
+
+
 def _numbers(value: object) -> np.ndarray:
     """`value` as an array; NaN where it is none."""
     try:
@@ -293,7 +291,7 @@ def _loosened_active_set(
         -1.0,
         dust,
         0,
-        PIVOTS_PER_ROW * sum(rows.A.shape),
+        _pivots(rows),
     )
 
 
