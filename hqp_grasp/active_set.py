@@ -272,7 +272,7 @@ def _line_up(A, only, rough, work):
 
 
 @njit(cache=True, error_model="numpy")
-def _pick(work, lo, hi, ma, c, steps, dust, rough):
+def _pick(work, lo, hi, ma, c, steps, rough):
     """Pick rows lo:hi by the largest rest, and turn all rows so that coordinate c + r is theirs.
 
     Returns how many were picked, and whether some came close to the rank tolerance `rough`.
@@ -289,7 +289,7 @@ def _pick(work, lo, hi, ma, c, steps, dust, rough):
         best = 0.0
         pick = row
         for i in range(row, hi):
-            tiny = dust * d * length[i]
+            tiny = DUST * d * length[i]
             if left[i] <= tiny * tiny:
                 if left[i] > 0.0:
                     for j in range(d, n):
@@ -388,10 +388,10 @@ def _least_squares(work, lo, hi, c, r):
 
 
 @njit(cache=True, error_model="numpy")
-def _reduce(A, off, act, only, row_norm, frobenius, rough, dust, work, x):
+def _reduce(A, off, act, only, row_norm, frobenius, rough, work, x):
     """Lexicographic least squares of the rows with act ≠ 0, as equalities at their target: x.
 
-    What is left of a row, after it is reduced by c others, counts as nothing below `dust` × c of
+    What is left of a row, after it is reduced by c others, counts as nothing below DUST × c of
     its length; singular values, below `rough` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
     """
     n = A.shape[1]
@@ -421,7 +421,7 @@ def _reduce(A, off, act, only, row_norm, frobenius, rough, dust, work, x):
         if k < lined_up:
             r = work.made[k] = m
         elif m > 0 and c < n and frobenius[k] > 0.0:
-            r, ambiguous = _pick(work, lo, hi, ma, c, min(m, n - c), dust, rough[k])
+            r, ambiguous = _pick(work, lo, hi, ma, c, min(m, n - c), rough[k])
             work.made[k] = r
             if ambiguous:
                 tol = rough[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
@@ -684,7 +684,7 @@ def _unwilling(off, act, frobenius, row_norm, length, kept, single, late, work):
 
 
 @njit(cache=True, error_model="numpy")
-def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust, blocks, pivots):
+def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     First up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
@@ -692,7 +692,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
     the primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
     Sherikov & Wieber 2015); with blocks = 0 it is that method, from x = 0. Ends after
     blocks + pivots steps at the latest; whether it found the optimum is for the certificate to
-    say. rank_tolerance < 0 asks for the default; `dust` is explained at `_reduce`.
+    say. rank_tolerance < 0 asks for the default.
 
     Returns x (n,), the multipliers (M, p + 1) explained at `_column`, and rank (p,).
     """
@@ -726,7 +726,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, dust,
         for i in range(M):
             if act[i] != 0:
                 target[i] = upper[i] if act[i] > 0 else lower[i]
-        _reduce(A, off, act, only, row_norm, frobenius, rough, dust, work, x)
+        _reduce(A, off, act, only, row_norm, frobenius, rough, work, x)
         length = np.sqrt(_dot(x, x))
         for k in range(p):  # where x vanishes by cancellation, what the levels ask of it counts
             s = 0.0

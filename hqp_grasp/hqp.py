@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import daqp
 import numpy as np
@@ -27,9 +26,6 @@ from hqp_grasp.level import (
 QUICK_ROUNDS = 10  # rounds at most of the active-set search before it moves one row at a time,
 POLISH_ROUNDS = 20  # the same, to settle an active set that something else has named
 PIVOTS = 6  # steps of one row, for each row and unknown, before another way is tried
-DRAWS = 2  # times that bounds are drawn apart
-COARSE = 1e-13  # [–] of a row: at last, rows dependent to this are taken as dependent
-LOOSEN = 1e-7  # [–] of a row's size: how far bounds are drawn apart so that no two rows tie
 BACKEND_EPS = 1e-9  # absolute accuracy asked of a QP solver; polishing does the rest
 STRONG = 1e-6  # [–] scaled slack or dual above which a backend's row counts as active
 ABSURD = 1e100  # a backend's answer beyond this is none
@@ -67,10 +63,11 @@ class HQP:
     - "shortcut": the equalities alone or the warm start's active set, settled by exact active-set
       steps (left out where `shortcuts` is False);
     - the QP solver, level by level in the freedom left, its active set settled likewise;
-    - "one row at a time": the exact primal method, then with bounds drawn apart, then with rows
-      that are dependent to 1e-13 taken as dependent;
-    - "many digits": the same method in decimal arithmetic, for levels whose rows differ in size by
-      1e10 or more. It takes a second; some ten in 100,000 problems of benchmarks/fuzz.py need it.
+    - "one row at a time": the exact primal method;
+    - "many digits": level by level in decimal arithmetic, for levels whose rows differ in size by
+      1e10 or more. It takes up to a second or two; some ten in 100,000 problems of
+      benchmarks/fuzz.py need it. Rows dependent to 1e-13 (then to 1e-11) are taken as dependent,
+      whatever `rank_tolerance` says.
 
     Solution.method names the way, Solution.failed the ways before it. Where several x are optimal
     the shortest is returned. Where it cannot be shown which that is, because rows depend on one
@@ -115,26 +112,23 @@ class HQP:
             found = self._settle(levels, rows, norms, act, self.solver, tried, POLISH_ROUNDS)
             if found is not None:
                 return found
-        for dust, draw in product((active_set.DUST, COARSE), range(1 + DRAWS)):
-            act = equalities.copy()
-            if draw:
-                _loosened_active_set(rows, norms, act, draw, dust)
-            rounds = POLISH_ROUNDS if draw else 0
-            found = self._settle(levels, rows, norms, act, "one row at a time", tried, rounds, dust)
-            if found is not None:
-                return found
-        if not tried.spare:
+        act = equalities.copy()
+        found = self._settle(levels, rows, norms, act, "one row at a time", tried, 0)
+        if found is not None:
+            return found
+        proof = np.zeros((len(rows.A), len(levels) + 1))  # the certificate finds its own
+        for known in many_digits.KNOWN:
             act = equalities.copy()
             try:
-                exact = many_digits.search(
-                    rows.A, rows.lower, rows.upper, rows.offsets, act, _pivots(rows)
+                x, rank = many_digits.search(
+                    rows.A, rows.lower, rows.upper, rows.offsets, act, known
                 )
             except ArithmeticError as error:
-                tried.failed.append(f"many digits: {error!r}")
-            else:
-                found = self._certified(levels, rows, act, *exact, "many digits", tried)
-                if found is not None:
-                    return found
+                tried.failed.append(f"many digits: {error or 'they do not do'}")
+                continue
+            found = self._certified(levels, rows, act, x, proof, rank, "many digits", tried)
+            if found is not None:
+                return found
         if tried.spare:
             shortest = min(tried.spare, key=lambda spare: float(np.linalg.norm(spare.x)))
             return replace(shortest, failed=tuple(tried.failed))
@@ -190,7 +184,6 @@ class HQP:
         method: str,
         tried: _Tried,
         rounds: int,
-        dust: float = active_set.DUST,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `tried`, where it fails."""
         row_norm, frobenius = norms
@@ -203,9 +196,8 @@ class HQP:
             frobenius,
             row_norm,
             -1.0 if self.rank_tolerance is None else self.rank_tolerance,
-            dust,
             rounds,
-            _pivots(rows),
+            PIVOTS * sum(rows.A.shape),
         )
         return self._certified(levels, rows, act, x, multipliers, rank, method, tried)
 
@@ -251,48 +243,12 @@ class HQP:
         return answer
 
 
-def _pivots(rows: Stacked) -> int:
-    """Steps of one row that a search may take."""
-    return PIVOTS * sum(rows.A.shape)
-
-
 def _numbers(value: object) -> np.ndarray:
     """`value` as an array; NaN where it is none."""
     try:
         return np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         return np.array(np.nan)
-
-
-def _loosened_active_set(
-    rows: Stacked,
-    norms: tuple[np.ndarray, np.ndarray],
-    act: np.ndarray,
-    draw: int,
-    dust: float,
-) -> None:
-    """Set `act` to that of a problem whose bounds are a little apart, each by another amount.
-
-    Where many rows meet in one point, moving one row at a time can go in circles; ties broken
-    like this, it cannot. What it finds is then settled with the true bounds.
-    """
-    row_norm, frobenius = norms
-    size = np.abs(np.clip(0.0, rows.lower, rows.upper)) + row_norm
-    apart = LOOSEN * size * np.random.default_rng(draw).uniform(1.0, 2.0, len(act))
-    apart[act == 2] = 0.0
-    active_set.search(
-        rows.A,
-        rows.lower - apart,
-        rows.upper + apart,
-        rows.offsets,
-        act,
-        frobenius,
-        row_norm,
-        -1.0,
-        dust,
-        0,
-        _pivots(rows),
-    )
 
 
 def _possible(act: np.ndarray, rows: Stacked) -> None:

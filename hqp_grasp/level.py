@@ -122,7 +122,8 @@ class Solution:
     x: np.ndarray  # (n,)
     levels: tuple[LevelReport, ...]
     active: np.ndarray  # (M,) int8 per stacked row: −1 at lower, +1 at upper, 2 equality, 0 free
-    multipliers: np.ndarray  # (M, p + 1): column k proves level k, the last that x is the shortest
+    multipliers: np.ndarray  # (M, p + 1): column k proves level k, the last that x is the shortest;
+    # 0 where found with many digits: there the certificate finds its own
     method: str  # the way that found x
     failed: tuple[str, ...] = ()  # ways tried before whose answers failed the certificate
     rank_tolerance: float = 0.0  # [–] the user's, 0 for the default rule
