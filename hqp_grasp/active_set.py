@@ -36,19 +36,23 @@ SIGNED = 1e-15  # [–] wrong sign of a multiplier, in units of its level's scal
 SURE = 1e-1  # [–] of what is doubtful about a multiplier; below it, it counts as none in any case
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc"})
-def _dot(a, b):
+# Rows are passed as a flat array, where they begin and their length. Slices would be counted
+# references, and indices that might be negative keep loops from becoming vector instructions; both
+# cost more than the arithmetic of a short row.
+@njit(cache=True, error_model="numpy", fastmath={"reassoc"}, forceinline=True)
+def _dot(a, i, b, j, m):
+    """a[i : i + m] · b[j : j + m]"""
     s = 0.0
-    for j in range(len(a)):
-        s += a[j] * b[j]
+    for l in range(np.uint64(m)):
+        s += a[np.uint64(i) + l] * b[np.uint64(j) + l]
     return s
 
 
-@njit(cache=True, error_model="numpy")
-def _subtract(a, s, b):
-    """a −= s b"""
-    for j in range(len(a)):
-        a[j] -= s * b[j]
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _subtract(a, i, s, b, j, m):
+    """a[i : i + m] −= s b[j : j + m]"""
+    for l in range(np.uint64(m)):
+        a[np.uint64(i) + l] -= s * b[np.uint64(j) + l]
 
 
 @njit(cache=True, error_model="numpy")
@@ -109,14 +113,15 @@ def spectral_norm(A):
 
 
 @njit(cache=True, error_model="numpy")
-def _rotate(W, lo, hi, ma, c, r, tol, V):
-    """Turn the block L = W[lo:hi, c:c+r] into U Σ, largest first, and the rows below with it.
+def _rotate(lo, hi, c, r, tol, work):
+    """Turn the block L = W[lo:hi, c:c+r] into U Σ, largest first, and its directions with it.
 
-    Fills V (r, r), the rotation, and returns the number of singular values above tol. Where all
-    are, nothing is turned: triangles keep apart rows of very different size.
+    Returns the number of singular values above tol. Where all are, nothing is turned: triangles
+    keep apart rows of very different size.
     """
+    W, Z = work.W, work.Z
     L = W[lo:hi, c : c + r].copy()
-    turned = _jacobi(L, r, 1e-3 * tol)
+    V = _jacobi(L, r, 1e-3 * tol)
     sigma = np.empty(r)
     for j in range(r):
         s = 0.0
@@ -124,32 +129,20 @@ def _rotate(W, lo, hi, ma, c, r, tol, V):
             s += L[i, j] * L[i, j]
         sigma[j] = np.sqrt(s)
     kept = 0
-    order = np.empty(r, np.int64)
     for j in range(r):
-        best = 0
-        for l in range(r):
-            if sigma[l] > sigma[best]:
-                best = l
-        if sigma[best] > tol:
-            kept += 1
-        sigma[best] = -1.0
-        for i in range(r):
-            V[i, j] = turned[i, best]
-        order[j] = best
+        kept += sigma[j] > tol
     if kept == r:
         return kept
+    n = Z.shape[1]
+    flat, before = work.flat_z, Z[c : c + r].copy().ravel()
     for j in range(r):
+        best = np.argmax(sigma)
+        sigma[best] = -1.0
         for i in range(hi - lo):
-            W[lo + i, c + j] = L[i, order[j]]
-    row = np.empty(r)
-    for i in range(hi, ma):
-        for j in range(r):
-            row[j] = W[i, c + j]
-        for j in range(r):
-            s = 0.0
-            for l in range(r):
-                s += row[l] * V[l, j]
-            W[i, c + j] = s
+            W[lo + i, c + j] = L[i, best]
+        Z[c + j] = 0.0
+        for l in range(r):
+            _subtract(flat, (c + j) * n, -V[l, best], before, l * n, n)
     return kept
 
 
@@ -161,22 +154,24 @@ class Work(NamedTuple):
 
     rows: np.ndarray  # (M,) which rows are active, in the order they were picked,
     start: np.ndarray  # (p + 1,) and where each level's begin
-    first: np.ndarray  # (p + 1,) level k owns coordinates first[k]:first[k+1] of xq
-    made: np.ndarray  # (p,) pivots of each level; more than it owns where its rank was cut
+    first: np.ndarray  # (p + 1,) level k owns directions first[k]:first[k+1]
     triangular: np.ndarray  # (p,) whether L_k is square, and so needs no orthogonal factor
     turned: np.ndarray  # (p,) whether a rotation cut its rank
-    turn: np.ndarray  # (p, n, n) which
-    W: np.ndarray  # (M, n) the rows, turned: A Q
-    length: np.ndarray  # (M,) their norms
+    V: np.ndarray  # (M, n) the rows, the unknowns in the order below,
+    W: np.ndarray  # (M, n) and along the directions; those of levels above by `_complete`
+    Z: np.ndarray  # (n, n) the directions, one a row, orthonormal
+    flat_v: np.ndarray  # and the same numbers, row behind row
+    flat_w: np.ndarray
+    flat_z: np.ndarray
+    flat_t: np.ndarray
+    length: np.ndarray  # (M,) the norms of the rows
     left: np.ndarray  # (M,) the squared norms of what is left of the rows of the level at hand
-    H: np.ndarray  # (M, n) the reflector made from each picked row,
-    beta: np.ndarray  # (M,) its factor, 0 where the row only moved a column
-    column: np.ndarray  # (M,) from here
-    order: np.ndarray  # (n,) the unknowns, as the columns of W have them before any turn,
+    order: np.ndarray  # (n,) the unknowns: first those that rows of one entry hold, in their order,
     place: np.ndarray  # (n,) and where each stands
-    T: np.ndarray  # (M, n) thin orthogonal factors of the L_k that are not triangular
+    T: np.ndarray  # (n, M) thin orthogonal factors of the L_k that are not triangular, transposed
     R: np.ndarray  # (n, n) and their triangular ones
-    xq: np.ndarray  # (n,) Qᵀ x
+    xq: np.ndarray  # (n,) x along the directions
+    xv: np.ndarray  # (n,) and in the order above
     rhs: np.ndarray  # (M,)
     target: np.ndarray  # (M,) the bound at which each active row is held
     slack: np.ndarray  # (M,) how far a row may miss its bound by rounding
@@ -196,25 +191,28 @@ class Work(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _work(M, n, p):
+    V, W, Z, T = np.empty((M, n)), np.empty((M, n)), np.empty((n, n)), np.empty((n, M))
     return Work(
         rows=np.empty(M, np.int64),
         start=np.empty(p + 1, np.int64),
         first=np.zeros(p + 1, np.int64),
-        made=np.empty(p, np.int64),
         triangular=np.empty(p, np.bool_),
         turned=np.empty(p, np.bool_),
-        turn=np.empty((p, n, n)),
-        W=np.empty((M, n)),
+        V=V,
+        W=W,
+        Z=Z,
+        T=T,
+        flat_v=V.ravel(),
+        flat_w=W.ravel(),
+        flat_z=Z.ravel(),
+        flat_t=T.ravel(),
         length=np.empty(M),
         left=np.empty(M),
-        H=np.empty((M, n)),
-        beta=np.empty(M),
-        column=np.empty(M, np.int64),
         order=np.empty(n, np.int64),
         place=np.empty(n, np.int64),
-        T=np.empty((M, n)),
         R=np.empty((n, n)),
         xq=np.empty(n),
+        xv=np.empty(n),
         rhs=np.empty(M),
         target=np.zeros(M),
         slack=np.empty(M),
@@ -222,8 +220,8 @@ def _work(M, n, p):
         dim=np.empty(M),
         w=np.empty(M),
         missed=np.empty(p, np.bool_),
-        lam=np.empty((M, p + 1)),
-        doubt=np.empty((M, p + 1)),
+        lam=np.zeros((M, p + 1)),
+        doubt=np.zeros((M, p + 1)),
         side=np.zeros(M, np.int8),
         wrong=np.zeros(M, np.int8),
         g=np.empty(n),
@@ -248,19 +246,18 @@ def _only_entries(A):
     return only
 
 
-@njit(cache=True, error_model="numpy")
-def _line_up(A, only, rough, work):
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _line_up(A, only, rough, rows, start, order, place):
     """Let the unknowns stand first that the first levels hold by rows of one entry, in their order.
 
     Such rows need no pick and no turn. Returns how many levels have no others.
     """
-    rows, order, place = work.rows, work.order, work.place
     for j in range(len(order)):
         order[j] = j
         place[j] = j
     c = 0
     for k in range(len(rough)):
-        for i in range(work.start[k], work.start[k + 1]):
+        for i in range(start[k], start[k + 1]):
             j = only[rows[i]]
             if j < 0 or place[j] < c or abs(A[rows[i], j]) <= rough[k] * CLEAR:
                 return k
@@ -271,19 +268,19 @@ def _line_up(A, only, rough, work):
     return len(rough)
 
 
-@njit(cache=True, error_model="numpy")
-def _pick(work, lo, hi, ma, c, steps, rough):
-    """Pick rows lo:hi by the largest rest, and turn all rows so that coordinate c + r is theirs.
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _pick(rows, V, W, Z, flat, turned, left, length, v, s, lo, hi, c, o, rough):
+    """Pick rows lo:hi by the largest rest, and turn the directions so that c + r is the r-th's.
 
-    Returns how many were picked, and whether some came close to the rank tolerance `rough`.
+    Directions before o are unknowns and no part of it. Returns how many were picked, and whether
+    some came close to the rank tolerance `rough`.
     """
-    W, H, left, length = work.W, work.H, work.left, work.length
     n = W.shape[1]
     for i in range(lo, hi):
-        left[i] = _dot(W[i, c:], W[i, c:])
+        left[i] = _dot(flat, i * n + c, flat, i * n + c, n - c)
     ambiguous = False
     r = 0
-    while r < steps:
+    while r < min(hi - lo, n - c):
         d = c + r
         row = lo + r
         best = 0.0
@@ -304,8 +301,10 @@ def _pick(work, lo, hi, ma, c, steps, rough):
         if norm <= rough * CLEAR:
             ambiguous = True
         if pick != row:
-            work.rows[pick], work.rows[row] = work.rows[row], work.rows[pick]
+            rows[pick], rows[row] = rows[row], rows[pick]
             for j in range(n):
+                V[pick, j], V[row, j] = V[row, j], V[pick, j]
+            for j in range(c, n):
                 W[pick, j], W[row, j] = W[row, j], W[pick, j]
             length[pick], length[row] = length[row], length[pick]
             left[pick] = left[row]
@@ -318,67 +317,66 @@ def _pick(work, lo, hi, ma, c, steps, rough):
                 if entries > 1:
                     break
         if entries == 1:
-            work.beta[row] = 0.0
-            work.column[row] = only
-            for i in range(row, ma):
+            for i in range(row, hi):
                 moved = W[i, only]
                 W[i, only] = W[i, d]
                 W[i, d] = moved
-                if i < hi and moved != 0.0:
-                    left[i] = _dot(W[i, d + 1 :], W[i, d + 1 :])
+                if moved != 0.0:
+                    rest = i * n + d + 1
+                    left[i] = _dot(flat, rest, flat, rest, n - d - 1)
+            for j in range(o, n):
+                Z[only, j], Z[d, j] = Z[d, j], Z[only, j]
         else:
             alpha = -norm if W[row, d] > 0.0 else norm
             for j in range(d, n):
-                H[row, j] = W[row, j]
-            H[row, d] -= alpha
-            beta = 1.0 / (norm * abs(H[row, d]))
-            work.beta[row] = beta
+                v[j] = W[row, j]
+            v[d] -= alpha
+            beta = 1.0 / (norm * abs(v[d]))
             W[row, d] = alpha
             for j in range(d + 1, n):
                 W[row, j] = 0.0
-            for i in range(row + 1, ma):
-                s = _dot(W[i, d:], H[row, d:])
-                if s != 0.0:
-                    _subtract(W[i, d:], s * beta, H[row, d:])
-                if i < hi:
-                    left[i] = _dot(W[i, d + 1 :], W[i, d + 1 :])
+            for i in range(row + 1, hi):
+                rest = i * n + d
+                push = _dot(flat, rest, v, d, n - d)
+                if push != 0.0:
+                    _subtract(flat, rest, push * beta, v, d, n - d)
+                left[i] = _dot(flat, rest + 1, flat, rest + 1, n - d - 1)
+            for j in range(o, n):
+                s[j] = 0.0
+            for j in range(d, n):
+                _subtract(s, o, -v[j], turned, j * n + o, n - o)
+            for j in range(d, n):
+                _subtract(turned, j * n + o, beta * v[j], s, o, n - o)
         r += 1
     return r, ambiguous
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _least_squares(work, lo, hi, c, r):
     """Solve L y = rhs for coordinates c:c+r, in the least-squares sense; the rest stays in rhs."""
-    W, T, R, rhs, y = work.W, work.T, work.R, work.rhs, work.y
+    W, R, rhs, y = work.W, work.R, work.rhs, work.y
+    M, m = len(rhs), hi - lo
+    T = work.flat_t
     for j in range(r):  # Gram–Schmidt, twice is enough
-        for i in range(lo, hi):
-            T[i, c + j] = W[i, c + j]
+        own = (c + j) * M + lo
+        for i in range(m):
+            T[own + i] = W[lo + i, c + j]
         for l in range(j):
             R[c + l, c + j] = 0.0
         for _ in range(2):
             for l in range(j):
-                s = 0.0
-                for i in range(lo, hi):
-                    s += T[i, c + l] * T[i, c + j]
+                s = _dot(T, (c + l) * M + lo, T, own, m)
                 R[c + l, c + j] += s
-                for i in range(lo, hi):
-                    T[i, c + j] -= s * T[i, c + l]
-        s = 0.0
-        for i in range(lo, hi):
-            s += T[i, c + j] * T[i, c + j]
-        s = np.sqrt(s)
+                _subtract(T, own, s, T, (c + l) * M + lo, m)
+        s = np.sqrt(_dot(T, own, T, own, m))
         R[c + j, c + j] = s
-        for i in range(lo, hi):
-            T[i, c + j] /= s
+        for i in range(m):
+            T[own + i] /= s
         work.xq[c + j] = 0.0
     for _ in range(2):  # the second pass removes what rounding left
         for j in range(r):
-            s = 0.0
-            for i in range(lo, hi):
-                s += T[i, c + j] * rhs[i]
-            y[j] = s
-            for i in range(lo, hi):
-                rhs[i] -= s * T[i, c + j]
+            y[j] = _dot(T, (c + j) * M + lo, rhs, lo, m)
+            _subtract(rhs, lo, y[j], T, (c + j) * M + lo, m)
         for j in range(r - 1, -1, -1):
             s = y[j]
             for l in range(j + 1, r):
@@ -387,100 +385,123 @@ def _least_squares(work, lo, hi, c, r):
             work.xq[c + j] += y[j]
 
 
-@njit(cache=True, error_model="numpy")
-def _reduce(A, off, act, only, row_norm, frobenius, rough, work, x):
-    """Lexicographic least squares of the rows with act ≠ 0, as equalities at their target: x.
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _begin(A, lower, upper, off, act, only, row_norm, rough, work):
+    """Line up the active rows, levels and unknowns for `_reduce`; the first levels may be done."""
+    V, Z, order = work.V, work.Z, work.order
+    n = len(order)
+    ma = 0
+    for k in range(len(rough)):
+        work.start[k] = ma
+        for i in range(off[k], off[k + 1]):
+            if act[i] != 0:
+                work.rows[ma] = i
+                work.target[i] = upper[i] if act[i] > 0 else lower[i]
+                work.length[ma] = row_norm[i]
+                ma += 1
+    work.start[len(rough)] = ma
+    lined_up = _line_up(A, only, rough, work.rows, work.start, order, work.place)
+    for i in range(ma):
+        for j in range(n):
+            V[i, j] = A[work.rows[i], order[j]]
+    work.first[0] = 0
+    for k in range(lined_up):
+        c, lo = work.first[k], work.start[k]
+        m = work.start[k + 1] - lo
+        work.first[k + 1] = c + m
+        work.triangular[k] = True
+        work.turned[k] = False
+        for i in range(m):
+            work.xq[c + i] = work.xv[c + i] = work.target[work.rows[lo + i]] / V[lo + i, c + i]
+            work.wa[lo + i] = 0.0
+    c = work.first[lined_up]
+    for j in range(c, n):
+        work.xv[j] = 0.0
+        for l in range(c, n):
+            Z[j, l] = 1.0 if j == l else 0.0
+    return lined_up
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
+    """Lexicographic least squares of the active rows, as equalities at their target: x.
+
+    Takes in levels begin … end − 1; those above are reduced. Directions before o are unknowns.
 
     What is left of a row, after it is reduced by c others, counts as nothing below DUST × c of
     its length; singular values, below `rough` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
     """
-    n = A.shape[1]
-    p = len(off) - 1
-    W, xq, rows, rhs, order = work.W, work.xq, work.rows, work.rhs, work.order
-    ma = 0
-    for k in range(p):
-        work.start[k] = ma
-        for i in range(off[k], off[k + 1]):
-            if act[i] != 0:
-                rows[ma] = i
-                work.length[ma] = row_norm[i]
-                ma += 1
-    work.start[p] = ma
-    lined_up = _line_up(A, only, rough, work)
-    for i in range(ma):
-        for j in range(n):
-            W[i, j] = A[rows[i], order[j]]
-    c = 0
-    for k in range(p):
-        work.first[k] = c
-        lo, hi = work.start[k], work.start[k + 1]
+    V, W, Z, xq, xv, rhs = work.V, work.W, work.Z, work.xq, work.xv, work.rhs
+    n = len(x)
+    flat, along, turned = work.flat_v, work.flat_w, work.flat_z
+    for k in range(begin, end):
+        c, lo, hi = work.first[k], work.start[k], work.start[k + 1]
         m = hi - lo
         r = 0
-        work.made[k] = 0
         work.turned[k] = False
-        if k < lined_up:
-            r = work.made[k] = m
-        elif m > 0 and c < n and frobenius[k] > 0.0:
-            r, ambiguous = _pick(work, lo, hi, ma, c, min(m, n - c), rough[k])
-            work.made[k] = r
+        if m > 0 and c < n and frobenius[k] > 0.0:
+            for i in range(lo, hi):
+                for j in range(c, n):
+                    W[i, j] = V[i, j] if c == o else _dot(flat, i * n + o, turned, j * n + o, n - o)
+            r, ambiguous = _pick(
+                work.rows,
+                V,
+                W,
+                Z,
+                along,
+                turned,
+                work.left,
+                work.length,
+                work.y,
+                work.z,
+                lo,
+                hi,
+                c,
+                o,
+                rough[k],
+            )
             if ambiguous:
                 tol = rough[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
-                V = np.zeros((r, r))
-                r = _rotate(W, lo, hi, ma, c, r, tol, V)
-                work.turned[k] = r < work.made[k]
-                for i in range(work.made[k]):
-                    for j in range(work.made[k]):
-                        work.turn[k, i, j] = V[i, j]
-                if work.turned[k]:
-                    for i in range(lo, hi):
-                        for j in range(c + r, n):
-                            W[i, j] = 0.0
+                made = r
+                r = _rotate(lo, hi, c, r, tol, work)
+                work.turned[k] = r < made
         for i in range(lo, hi):
-            rhs[i] = work.target[rows[i]] - _dot(W[i, :c], xq)
+            rhs[i] = work.target[work.rows[i]] - _dot(flat, i * n, xv, 0, n)
         work.triangular[k] = r == m and not work.turned[k]
         if work.triangular[k]:
             for i in range(m):
-                s = rhs[lo + i] - _dot(W[lo + i, c : c + i], xq[c:])
+                s = rhs[lo + i] - _dot(along, (lo + i) * n + c, xq, c, i)
                 xq[c + i] = s / W[lo + i, c + i]
                 rhs[lo + i] = 0.0
         else:
             _least_squares(work, lo, hi, c, r)
         for i in range(lo, hi):
             work.wa[i] = -rhs[i]
-        c += r
-    work.first[p] = c
+        for j in range(c, c + r):
+            _subtract(xv, o, -xq[j], turned, j * n + o, n - o)
+        work.first[k + 1] = c + r
     for j in range(n):
-        x[j] = xq[j] if j < c else 0.0
-    for k in range(p - 1, lined_up - 1, -1):  # x = Q xq, the factors of Q, the last first
-        a, r = work.first[k], work.made[k]
-        if work.turned[k]:
-            for i in range(r):
-                s = 0.0
-                for j in range(r):
-                    s += work.turn[k, i, j] * x[a + j]
-                work.y[i] = s
-            for i in range(r):
-                x[a + i] = work.y[i]
-        for l in range(r - 1, -1, -1):
-            row = work.start[k] + l
-            d = a + l
-            if work.beta[row] == 0.0:
-                only = work.column[row]
-                x[d], x[only] = x[only], x[d]
-                continue
-            s = work.beta[row] * _dot(work.H[row, d:], x[d:])
-            _subtract(x[d:], s, work.H[row, d:])
-    for j in range(n):
-        work.y[order[j]] = x[j]
-    x[:] = work.y
+        x[work.order[j]] = xv[j]
 
 
-@njit(cache=True, error_model="numpy")
-def _weigh(work):
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _complete(levels, o, work):
+    """Fill in W along the directions of the levels above."""
+    n = len(work.xv)
+    flat, turned = work.flat_v, work.flat_z
+    for k in range(levels):
+        for i in range(work.start[k], work.start[k + 1]):
+            for j in range(min(o, work.first[k + 1])):
+                work.W[i, j] = work.V[i, j]
+            for j in range(o, work.first[k]):
+                work.W[i, j] = _dot(flat, i * n + o, turned, j * n + o, n - o)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _weigh(levels, work):
     """The residuals of the active rows: those of the size of rounding are none."""
-    p = len(work.made)
     work.w[:] = 0.0
-    for k in range(p):
+    for k in range(levels):
         work.missed[k] = False
         for i in range(work.start[k], work.start[k + 1]):
             size = abs(work.target[work.rows[i]])
@@ -492,23 +513,23 @@ def _weigh(work):
                 work.w[work.rows[i]] = work.wa[i]
 
 
-@njit(cache=True, error_model="numpy")
-def _column(k, work):
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _column(k, levels, work):
     """Column k of lam (M, p + 1), the multipliers of the rows above for level k's optimality.
 
-    A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; column p has those of the minimum norm of x. Rows of level
+    A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; the one behind the last of the `levels` taken in, p in the
+    end, has those of the minimum norm of x. Rows of level
     k hold w_k there, with more digits than w has. `doubt`, of the same shape, is how much of lam
     may be rounding.
     """
     W, T, R, rows, start, first = work.W, work.T, work.R, work.rows, work.start, work.first
     g, h, y, z = work.g, work.h, work.y, work.z
     length, lam, doubt = work.length, work.lam, work.doubt
-    p = len(work.made)
     for i in range(len(lam)):
         lam[i, k] = 0.0
         doubt[i, k] = 0.0
     top = first[k]
-    if k == p:
+    if k == levels:
         for j in range(top):
             g[j] = work.xq[j]
             h[j] = SIGNED * abs(work.xq[j])
@@ -543,7 +564,7 @@ def _column(k, work):
                 if W[i, j] != 0.0:
                     g[j] += W[i, j] * push
                     h[j] += abs(W[i, j]) * size + rounding
-    for l in range(min(k, p) - 1, -1, -1):
+    for l in range(k - 1, -1, -1):
         lo, hi = start[l], start[l + 1]
         a, r = first[l], first[l + 1] - first[l]
         if r == 0:
@@ -570,8 +591,8 @@ def _column(k, work):
                 s = 0.0
                 size = 0.0
                 for j in range(r):
-                    s += T[i, a + j] * z[j]
-                    size += abs(T[i, a + j]) * y[j]
+                    s += T[a + j, i] * z[j]
+                    size += abs(T[a + j, i]) * y[j]
                 lam[rows[i], k] = s
                 doubt[rows[i], k] = size
         for i in range(lo, hi):
@@ -595,7 +616,7 @@ def equalities(lower, upper):
     return act
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _judge(own, side, w, room, push, doubt, scale):
     """Whether a column shows that an active row holds x back: 1 yes, −1 it pushes well, 0 neither.
 
@@ -610,21 +631,22 @@ def _judge(own, side, w, room, push, doubt, scale):
     return 1 if push * side < -none else 0
 
 
-@njit(cache=True, error_model="numpy")
-def _broken(A, lower, upper, act, x, start, work):
-    """Mark the side on which x breaks each free row; count them, and find the first on the way.
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _broken(flat, lower, upper, act, x, start, end, work):
+    """Mark the side on which x breaks each free row before `end`; count, find the first on the way.
 
     Returns the count, that row (−1: none), and how far from `start` to x it lets one go, 0 to 1.
     """
     slack, side = work.slack, work.side
+    n = len(x)
     count = 0
     first = -1
     way = 1.0
-    for i in range(len(A)):
+    for i in range(end):
         side[i] = 0
         if act[i] != 0:
             continue
-        goal = _dot(A[i], x)
+        goal = _dot(flat, i * n, x, 0, n)
         if goal > upper[i] + slack[i] + FEASIBLE * abs(upper[i]):
             bound, side[i] = upper[i], 1
         elif goal < lower[i] - slack[i] - FEASIBLE * abs(lower[i]):
@@ -632,35 +654,35 @@ def _broken(A, lower, upper, act, x, start, work):
         else:
             continue
         count += 1
-        here = _dot(A[i], start)
+        here = _dot(flat, i * n, start, 0, n)
         ratio = max(0.0, (bound - here) / (goal - here)) if goal != here else 0.0
         if ratio < way or first < 0:
             way, first = ratio, i
     return count, first, way
 
 
-@njit(cache=True, error_model="numpy")
-def _unwilling(off, act, frobenius, row_norm, length, kept, single, late, work):
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late, work):
     """Mark the active rows that hold x back although a level would gain by letting go.
 
     Returns how many, and the worst of those that the first such level names (−1: none), or where it
     is `late` just the first. Where rows move `single`, the levels below are left out.
     """
-    p = len(off) - 1
     count = 0
     worst = -1
     w, lam, doubt, wrong = work.w, work.lam, work.doubt, work.wrong
-    _weigh(work)
-    for i in range(len(act)):  # 2: no column has decided on it yet
+    _weigh(levels, work)
+    for i in range(off[levels]):  # 2: no column has decided on it yet
         wrong[i] = 2 if (act[i] == 1 or act[i] == -1) and not kept[i] else 0
-    for k in range(p + 1):
-        _column(k, work)
+    k = 0
+    while k <= levels and not (single and worst >= 0):
+        _column(k, levels, work)
         scale = length
-        if k < p:
-            scale = frobenius[k] * np.sqrt(_dot(w[off[k] : off[k + 1]], w[off[k] : off[k + 1]]))
+        if k < levels:
+            scale = frobenius[k] * np.sqrt(_dot(w, off[k], w, off[k], off[k + 1] - off[k]))
         named = worst >= 0
         most = 0.0
-        for level in range(min(k + 1, p)):
+        for level in range(min(k + 1, levels)):
             for i in range(off[level], off[level + 1]):
                 if wrong[i] != 2:
                     continue
@@ -678,13 +700,12 @@ def _unwilling(off, act, frobenius, row_norm, length, kept, single, late, work):
                 size = abs(lam[i, k]) * unit
                 if not named and (worst < 0 or (size > most and not late)):
                     worst, most = i, size
-        if single and worst >= 0:
-            break
+        k += 1
     return count, worst
 
 
 @njit(cache=True, error_model="numpy")
-def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, blocks, pivots):
+def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     First up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
@@ -709,56 +730,75 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
         else:
             rough[k] = rank_tolerance * frobenius[k]
     only = _only_entries(A)
+    flat = A.ravel()
     target, side, wrong = work.target, work.side, work.wrong
     x = np.zeros(n)
     start = np.zeros(n)  # the point that the steps of one row have reached
     kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
     last = -1  # row and side let go in the step before
     last_side = 0
-    fewest = M + 1
-    single = blocks == 0
-    if single:
+    if blocks == 0:
         for i in range(M):
             if act[i] != 2:
                 act[i] = 1 if upper[i] < 0.0 else (-1 if lower[i] > 0.0 else 0)
-    begun = 0  # the step at which one row at a time began
+    levels = first  # taken in
+    reduced = -1  # of them; −1: none, and the active set is new
+    o = 0
+    single = blocks == 0
+    fewest = M + 1
+    begun = 0  # the step at which these levels began,
+    alone = 0  # and one row at a time
     for step in range(blocks + pivots):
-        for i in range(M):
-            if act[i] != 0:
-                target[i] = upper[i] if act[i] > 0 else lower[i]
-        _reduce(A, off, act, only, row_norm, frobenius, rough, work, x)
-        length = np.sqrt(_dot(x, x))
-        for k in range(p):  # where x vanishes by cancellation, what the levels ask of it counts
+        if reduced < 0:
+            reduced = _begin(A, lower, upper, off, act, only, row_norm, rough, work)
+            o = work.first[reduced]
+        levels = max(levels, reduced)
+        end = off[levels]
+        _reduce(A, off, reduced, levels, o, frobenius, rough, work, x)
+        reduced = levels
+        length = np.sqrt(_dot(x, 0, x, 0, n))
+        for k in range(levels):  # where x vanishes by cancellation, what the levels ask counts
             s = 0.0
             for i in range(off[k], off[k + 1]):
                 if act[i] != 0:
                     s += target[i] * target[i]
             if frobenius[k] > 0.0:
                 length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
-        for i in range(M):
+        for i in range(end):
             work.slack[i] = FEASIBLE * row_norm[i] * length
-        broken, block, alpha = _broken(A, lower, upper, act, x, start, work)
+        broken, block, alpha = _broken(flat, lower, upper, act, x, start, end, work)
         unwilling = 0
         drop = -1
         if not single or block < 0:
-            late = 2 * (step - begun) > pivots  # Bland: the first one, so that it ends
+            late = 2 * (step - alone) > pivots  # Bland: the first one, so that it ends
+            _complete(levels, o, work)
             unwilling, drop = _unwilling(
-                off, act, frobenius, row_norm, length, kept, single, late, work
+                off, levels, act, frobenius, row_norm, length, kept, single, late, work
             )
         count = broken + unwilling
         if count == 0:
-            break
+            if levels == p:
+                break
+            levels += 1
+            start[:] = x
+            single = blocks == 0
+            fewest = M + 1
+            begun = step + 1
+            kept[:] = False
+            last = -1
+            continue
+        reduced = -1
         if not single:
-            if count < fewest and step + 1 < blocks:
+            if count < fewest and step + 1 < begun + blocks:
                 fewest = count
-                for i in range(M):
+                for i in range(end):
                     if wrong[i] == 1:
                         act[i] = 0
                     elif side[i] != 0:
                         act[i] = side[i]
                 continue
             single = True
-            begun = step
+            alone = step
         if block >= 0:
             for j in range(n):
                 start[j] += alpha * (x[j] - start[j])
@@ -774,7 +814,12 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, block
             last, last_side = drop, act[drop]
             act[drop] = 0
     else:
-        _weigh(work)
+        if reduced < 0:
+            reduced = _begin(A, lower, upper, off, act, only, row_norm, rough, work)
+            o = work.first[reduced]
+        _reduce(A, off, reduced, p, o, frobenius, rough, work, x)
+        _complete(p, o, work)
+        _weigh(p, work)
         for k in range(p + 1):
-            _column(k, work)
+            _column(k, p, work)
     return x, work.lam, work.first[1:] - work.first[:-1]

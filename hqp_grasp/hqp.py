@@ -100,7 +100,7 @@ class HQP:
                 held = np.abs(warm.active) == 1
                 act[held & (act == 0)] = warm.active[held & (act == 0)]
                 _possible(act, rows)
-            found = self._settle(levels, rows, norms, act, "shortcut", tried, QUICK_ROUNDS)
+            found = self._settle(levels, rows, norms, act, "shortcut", tried, 1, QUICK_ROUNDS)
             if found is not None:
                 return found
         try:
@@ -109,11 +109,13 @@ class HQP:
         except _BackendError as failure:
             tried.failed.append(f"{self.solver}: {failure}")
         else:
-            found = self._settle(levels, rows, norms, act, self.solver, tried, POLISH_ROUNDS)
+            found = self._settle(
+                levels, rows, norms, act, self.solver, tried, len(levels), POLISH_ROUNDS
+            )
             if found is not None:
                 return found
         act = equalities.copy()
-        found = self._settle(levels, rows, norms, act, "one row at a time", tried, 0)
+        found = self._settle(levels, rows, norms, act, "one row at a time", tried, len(levels), 0)
         if found is not None:
             return found
         proof = np.zeros((len(rows.A), len(levels) + 1))  # the certificate finds its own
@@ -183,6 +185,7 @@ class HQP:
         act: np.ndarray,
         method: str,
         tried: _Tried,
+        first: int,
         rounds: int,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `tried`, where it fails."""
@@ -196,6 +199,7 @@ class HQP:
             frobenius,
             row_norm,
             -1.0 if self.rank_tolerance is None else self.rank_tolerance,
+            first,
             rounds,
             PIVOTS * sum(rows.A.shape),
         )
