@@ -4,15 +4,19 @@ Everything here is compiled by numba at first use and cached; arrays in, arrays 
 all levels are stacked; `act` says how each takes part: 2 equality, +1 held at its upper bound,
 −1 held at its lower, 0 free.
 
-Each level is reduced in the freedom left by those above: rows are picked by the largest remaining
-norm and turned by Householder reflections from the right (Golub & Van Loan, ch. 5), so that
-A_k Q = [… L_k 0] with L_k (m, r). A row with one entry left, such as a bound of one unknown, needs
-no reflection: its column changes place; first levels that hold nothing but such rows, as box
-limits do, are not turned at all. Where a pivot comes close to the rank tolerance, a one-sided
-Jacobi SVD of L_k decides the rank on singular values, as the convention asks.
+Each level is reduced in the freedom left by those above: its rows are seen along the directions
+that are left, picked by the largest remaining norm, and the directions turned by Householder
+reflections (Golub & Van Loan, ch. 5) so that A_k Zᵀ = [… L_k 0] with L_k (m, r). So a level costs
+only what the freedom left is large, and levels below need not be there yet. A row with one entry
+left, such as a bound of one unknown, needs no reflection: two directions change place; first levels
+that hold nothing but such rows, as box limits do, are not turned at all. Where a pivot comes close
+to the rank tolerance, a one-sided Jacobi SVD of L_k decides the rank on singular values, as the
+convention asks.
 
-`search` allocates one Work and fills it anew in every step: `_reduce` finds x, `_weigh` the
-residuals, and `_column` the multipliers of one level, which only points worth judging need.
+`search` allocates one Work and fills it anew for every active set: `_begin` and `_reduce` find x,
+`_weigh` the residuals, and `_column` the multipliers of one level, which only points worth judging
+need. All are inlined (`forceinline`): a call with Work as argument counts a reference for each of
+its arrays, up and down, which takes longer than the arithmetic of a dozen unknowns.
 """
 
 from __future__ import annotations
@@ -708,7 +712,8 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
 def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
-    First up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
+    Begins with the first `first` levels and takes in the next where these are settled. At each:
+    up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
     at once, for as long as there are ever fewer of them. Then steps that move one row each, as
     the primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
     Sherikov & Wieber 2015); with blocks = 0 it is that method, from x = 0. Ends after
