@@ -117,7 +117,7 @@ def spectral_norm(A):
 
 
 @njit(cache=True, error_model="numpy")
-def _rotate(lo, hi, c, r, tol, work):
+def _rotate(lo, hi, c, o, r, tol, work):
     """Turn the block L = W[lo:hi, c:c+r] into U Σ, largest first, and its directions with it.
 
     Returns the number of singular values above tol. Where all are, nothing is turned: triangles
@@ -138,15 +138,15 @@ def _rotate(lo, hi, c, r, tol, work):
     if kept == r:
         return kept
     n = Z.shape[1]
-    flat, before = work.flat_z, Z[c : c + r].copy().ravel()
+    before = Z[c : c + r].copy().ravel()
     for j in range(r):
         best = np.argmax(sigma)
         sigma[best] = -1.0
         for i in range(hi - lo):
             W[lo + i, c + j] = L[i, best]
-        Z[c + j] = 0.0
+        Z[c + j, o:] = 0.0
         for l in range(r):
-            _subtract(flat, (c + j) * n, -V[l, best], before, l * n, n)
+            _subtract(work.flat_z, (c + j) * n + o, -V[l, best], before, l * n + o, n - o)
     return kept
 
 
@@ -163,8 +163,9 @@ class Work(NamedTuple):
     turned: np.ndarray  # (p,) whether a rotation cut its rank
     V: np.ndarray  # (M, n) the rows, the unknowns in the order below,
     W: np.ndarray  # (M, n) and along the directions; those of levels above by `_complete`
-    Z: np.ndarray  # (n, n) the directions, one a row, orthonormal
-    flat_v: np.ndarray  # and the same numbers, row behind row
+    Z: np.ndarray  # (n, n) the directions, one a row, orthonormal; those lined up are not filled in
+    T: np.ndarray  # (n, M) thin orthogonal factors of the L_k that are not triangular, transposed
+    flat_v: np.ndarray  # V, W, Z and T, row behind row
     flat_w: np.ndarray
     flat_z: np.ndarray
     flat_t: np.ndarray
@@ -172,8 +173,7 @@ class Work(NamedTuple):
     left: np.ndarray  # (M,) the squared norms of what is left of the rows of the level at hand
     order: np.ndarray  # (n,) the unknowns: first those that rows of one entry hold, in their order,
     place: np.ndarray  # (n,) and where each stands
-    T: np.ndarray  # (n, M) thin orthogonal factors of the L_k that are not triangular, transposed
-    R: np.ndarray  # (n, n) and their triangular ones
+    R: np.ndarray  # (n, n) the triangular factors that belong to T
     xq: np.ndarray  # (n,) x along the directions
     xv: np.ndarray  # (n,) and in the order above
     rhs: np.ndarray  # (M,)
@@ -273,7 +273,7 @@ def _line_up(A, only, rough, rows, start, order, place):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _pick(rows, V, W, Z, flat, turned, left, length, v, s, lo, hi, c, o, rough):
+def _pick(rows, V, W, Z, flat_w, flat_z, left, length, v, s, lo, hi, c, o, rough):
     """Pick rows lo:hi by the largest rest, and turn the directions so that c + r is the r-th's.
 
     Directions before o are unknowns and no part of it. Returns how many were picked, and whether
@@ -281,7 +281,7 @@ def _pick(rows, V, W, Z, flat, turned, left, length, v, s, lo, hi, c, o, rough):
     """
     n = W.shape[1]
     for i in range(lo, hi):
-        left[i] = _dot(flat, i * n + c, flat, i * n + c, n - c)
+        left[i] = _dot(flat_w, i * n + c, flat_w, i * n + c, n - c)
     ambiguous = False
     r = 0
     while r < min(hi - lo, n - c):
@@ -327,7 +327,7 @@ def _pick(rows, V, W, Z, flat, turned, left, length, v, s, lo, hi, c, o, rough):
                 W[i, d] = moved
                 if moved != 0.0:
                     rest = i * n + d + 1
-                    left[i] = _dot(flat, rest, flat, rest, n - d - 1)
+                    left[i] = _dot(flat_w, rest, flat_w, rest, n - d - 1)
             for j in range(o, n):
                 Z[only, j], Z[d, j] = Z[d, j], Z[only, j]
         else:
@@ -341,16 +341,16 @@ def _pick(rows, V, W, Z, flat, turned, left, length, v, s, lo, hi, c, o, rough):
                 W[row, j] = 0.0
             for i in range(row + 1, hi):
                 rest = i * n + d
-                push = _dot(flat, rest, v, d, n - d)
+                push = _dot(flat_w, rest, v, d, n - d)
                 if push != 0.0:
-                    _subtract(flat, rest, push * beta, v, d, n - d)
-                left[i] = _dot(flat, rest + 1, flat, rest + 1, n - d - 1)
+                    _subtract(flat_w, rest, push * beta, v, d, n - d)
+                left[i] = _dot(flat_w, rest + 1, flat_w, rest + 1, n - d - 1)
             for j in range(o, n):
                 s[j] = 0.0
             for j in range(d, n):
-                _subtract(s, o, -v[j], turned, j * n + o, n - o)
+                _subtract(s, o, -v[j], flat_z, j * n + o, n - o)
             for j in range(d, n):
-                _subtract(turned, j * n + o, beta * v[j], s, o, n - o)
+                _subtract(flat_z, j * n + o, beta * v[j], s, o, n - o)
         r += 1
     return r, ambiguous
 
@@ -437,7 +437,7 @@ def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
     """
     V, W, Z, xq, xv, rhs = work.V, work.W, work.Z, work.xq, work.xv, work.rhs
     n = len(x)
-    flat, along, turned = work.flat_v, work.flat_w, work.flat_z
+    flat_v, flat_w, flat_z = work.flat_v, work.flat_w, work.flat_z
     for k in range(begin, end):
         c, lo, hi = work.first[k], work.start[k], work.start[k + 1]
         m = hi - lo
@@ -446,14 +446,16 @@ def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
         if m > 0 and c < n and frobenius[k] > 0.0:
             for i in range(lo, hi):
                 for j in range(c, n):
-                    W[i, j] = V[i, j] if c == o else _dot(flat, i * n + o, turned, j * n + o, n - o)
+                    W[i, j] = (
+                        V[i, j] if c == o else _dot(flat_v, i * n + o, flat_z, j * n + o, n - o)
+                    )
             r, ambiguous = _pick(
                 work.rows,
                 V,
                 W,
                 Z,
-                along,
-                turned,
+                flat_w,
+                flat_z,
                 work.left,
                 work.length,
                 work.y,
@@ -467,14 +469,14 @@ def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
             if ambiguous:
                 tol = rough[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
                 made = r
-                r = _rotate(lo, hi, c, r, tol, work)
+                r = _rotate(lo, hi, c, o, r, tol, work)
                 work.turned[k] = r < made
         for i in range(lo, hi):
-            rhs[i] = work.target[work.rows[i]] - _dot(flat, i * n, xv, 0, n)
+            rhs[i] = work.target[work.rows[i]] - _dot(flat_v, i * n, xv, 0, n)
         work.triangular[k] = r == m and not work.turned[k]
         if work.triangular[k]:
             for i in range(m):
-                s = rhs[lo + i] - _dot(along, (lo + i) * n + c, xq, c, i)
+                s = rhs[lo + i] - _dot(flat_w, (lo + i) * n + c, xq, c, i)
                 xq[c + i] = s / W[lo + i, c + i]
                 rhs[lo + i] = 0.0
         else:
@@ -482,7 +484,7 @@ def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
         for i in range(lo, hi):
             work.wa[i] = -rhs[i]
         for j in range(c, c + r):
-            _subtract(xv, o, -xq[j], turned, j * n + o, n - o)
+            _subtract(xv, o, -xq[j], flat_z, j * n + o, n - o)
         work.first[k + 1] = c + r
     for j in range(n):
         x[work.order[j]] = xv[j]
@@ -492,13 +494,13 @@ def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
 def _complete(levels, o, work):
     """Fill in W along the directions of the levels above."""
     n = len(work.xv)
-    flat, turned = work.flat_v, work.flat_z
+    flat_v, flat_z = work.flat_v, work.flat_z
     for k in range(levels):
         for i in range(work.start[k], work.start[k + 1]):
             for j in range(min(o, work.first[k + 1])):
                 work.W[i, j] = work.V[i, j]
             for j in range(o, work.first[k]):
-                work.W[i, j] = _dot(flat, i * n + o, turned, j * n + o, n - o)
+                work.W[i, j] = _dot(flat_v, i * n + o, flat_z, j * n + o, n - o)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -522,9 +524,8 @@ def _column(k, levels, work):
     """Column k of lam (M, p + 1), the multipliers of the rows above for level k's optimality.
 
     A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; the one behind the last of the `levels` taken in, p in the
-    end, has those of the minimum norm of x. Rows of level
-    k hold w_k there, with more digits than w has. `doubt`, of the same shape, is how much of lam
-    may be rounding.
+    end, has those of the minimum norm of x. Rows of level k hold w_k there, with more digits than
+    w has. `doubt`, of the same shape, is how much of lam may be rounding.
     """
     W, T, R, rows, start, first = work.W, work.T, work.R, work.rows, work.start, work.first
     g, h, y, z = work.g, work.h, work.y, work.z

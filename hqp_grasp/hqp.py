@@ -60,12 +60,12 @@ class HQP:
 
     An answer is found by the first of these ways that passes the optimality certificate:
 
-    - "shortcut": the equalities alone or the warm start's active set, settled by exact active-set
-      steps (left out where `shortcuts` is False);
+    - "shortcut": exact active-set steps from the equalities alone, level by level, or from the warm
+      start's active set, all levels at once (left out where `shortcuts` is False);
     - the QP solver, level by level in the freedom left, its active set settled likewise;
     - "one row at a time": the exact primal method;
     - "many digits": level by level in decimal arithmetic, for levels whose rows differ in size by
-      1e10 or more. It takes up to a second or two; some ten in 100,000 problems of
+      1e10 or more. It takes up to a second or two; a few in 100,000 problems of
       benchmarks/fuzz.py need it. Rows dependent to 1e-13 (then to 1e-11) are taken as dependent,
       whatever `rank_tolerance` says.
 
@@ -96,11 +96,13 @@ class HQP:
         tried = _Tried([], [])
         if self.shortcuts:
             act = equalities.copy()
+            first = 1
             if warm is not None and len(warm.active) == len(act):
+                first = len(levels)
                 held = np.abs(warm.active) == 1
                 act[held & (act == 0)] = warm.active[held & (act == 0)]
                 _possible(act, rows)
-            found = self._settle(levels, rows, norms, act, "shortcut", tried, 1, QUICK_ROUNDS)
+            found = self._settle(levels, rows, norms, act, "shortcut", tried, first, QUICK_ROUNDS)
             if found is not None:
                 return found
         try:
@@ -126,7 +128,7 @@ class HQP:
                     rows.A, rows.lower, rows.upper, rows.offsets, act, known
                 )
             except ArithmeticError as error:
-                tried.failed.append(f"many digits: {error or 'they do not do'}")
+                tried.failed.append(f"many digits: {error!r}")
                 continue
             found = self._certified(levels, rows, act, x, proof, rank, "many digits", tried)
             if found is not None:
@@ -303,7 +305,9 @@ def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray], backend: Backe
             )
             try:
                 y, z = backend(P, q, G, lower, upper)
-            except Exception as error:  # whatever a solver raises, another way is tried and told
+            # Each solver raises what it likes, and qpsolvers passes it on; `backend` is all that is
+            # tried here, and what it raised is told in Solution.failed or in the SolverError.
+            except Exception as error:
                 reason = str(error) if isinstance(error, _BackendError) else repr(error)
                 raise _BackendError(f"level {k}: {reason}") from error
             # NaN compares false

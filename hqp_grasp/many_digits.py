@@ -3,8 +3,8 @@
 Rows of one level whose sizes differ by ten orders of magnitude or more leave residuals whose
 rounding hides the forces of the small rows; no tolerance tells their signs. With enough digits none
 is needed: each level is a least-distance problem in the freedom that those above leave, solved by
-the dual active-set method (Goldfarb & Idnani 1983), which cannot go in circles. Asked last: some
-ten in 100,000 problems of `benchmarks/fuzz.py` get here, and take up to a second or two.
+the dual active-set method (Goldfarb & Idnani 1983), which cannot go in circles. Asked last: a few
+in 100,000 problems of `benchmarks/fuzz.py` get here, and take up to a second or two.
 """
 
 from __future__ import annotations
@@ -112,13 +112,13 @@ def _shortest(
             c = len(active)
             along, rest = beside(pick)
             gain = rest @ rest
+            free = gain > VANISHED * (N[pick] @ N[pick])  # of those that are active
             rates = along.copy()  # of the active forces, R⁻¹ along
             for j in range(c - 1, -1, -1):
-                rates[j] = (rates[j] - (R[j, j + 1 : c] @ rates[j + 1 :] if j + 1 < c else 0)) / R[
-                    j, j
-                ]
+                rates[j] /= R[j, j]
+                rates[:j] -= rates[j] * R[:j, j]
             step, drop = INFINITY, -1
-            if gain > VANISHED * (N[pick] @ N[pick]):
+            if free:
                 step = (least[pick] - N[pick] @ z) / gain
             if pick >= equal:
                 for j in range(equal, c):
@@ -126,7 +126,7 @@ def _shortest(
                         step, drop = force[active[j]] / rates[j], j
             if step.is_infinite():
                 raise ArithmeticError("rows that a level has met exclude one another")
-            if gain > VANISHED * (N[pick] @ N[pick]):
+            if free:
                 z = z + step * rest
             if c:
                 force[active] = force[active] - step * rates

@@ -309,6 +309,16 @@ def test_a_warm_start_from_its_own_answer_needs_no_solver():
         assert HQP().solve(levels, warm=first).method == "shortcut"
 
 
+def test_a_warm_start_from_its_own_answer_needs_one_active_set(monkeypatch):
+    levels = built(three_level(np.random.default_rng(0), "hard"))
+    answer = HQP().solve(levels)
+    assert (np.abs(answer.active) == 1).any()
+    monkeypatch.setattr(hqp_module, "QUICK_ROUNDS", 1)
+    monkeypatch.setattr(hqp_module, "PIVOTS", 0)
+    assert HQP().solve(levels, warm=answer).method == "shortcut"
+    assert HQP().solve(levels).method != "shortcut"
+
+
 def test_a_warm_start_from_another_problem_does_no_harm():
     rng = np.random.default_rng(0)
     problem = three_level(rng, "mid")
