@@ -15,7 +15,7 @@ import tyro
 from limits import WORSE, force_left, steps
 
 import hqp_grasp as hg
-from hqp_grasp.trial import TOUCH_RANK
+from hqp_grasp.experiments.trial import TOUCH_RANK
 
 OBJECTS = {
     "cylinder, 5 cm": hg.Cylinder(radius=0.05),
@@ -80,7 +80,7 @@ def main(
         scene = hg.Scene(robot="wam_bhand", object=thing)
         probe = hg.GeometricProbe(scene)
         for name, cap in CAPS.items():
-            stack = hg.Stack.from_letters(letters)
+            stack = hg.stack_of(letters)
             stack = stack.within(cap, hg.ConfigurationLimit(scene.articulated))
             row = seen[shape, name] = Seen()
             for i in range(trials):

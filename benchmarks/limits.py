@@ -18,9 +18,9 @@ import numpy as np
 import tyro
 
 import hqp_grasp as hg
-from hqp_grasp.paper import paper_levels
-from hqp_grasp.start import first_touch
-from hqp_grasp.trial import FORMS, SR_DAMPING, TOUCH_RANK, Record, clip_to_limits
+from hqp_grasp.control.paper import paper_levels
+from hqp_grasp.experiments.start import first_touch
+from hqp_grasp.experiments.trial import FORMS, SR_DAMPING, TOUCH_RANK, Record, clip_to_limits
 
 WORSE = 1e-6  # [N] more than the hierarchy leaves
 OBJECT = hg.Cylinder(radius=0.05)
@@ -74,7 +74,7 @@ def main(
     scene = hg.Scene(robot="wam_bhand", object=OBJECT)
     probe = hg.GeometricProbe(scene)
     hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK)
-    laws = hg.Stack.from_letters("fmk")
+    laws = hg.stack_of("fmk")
     runs: dict[str, list[Record]] = {form: [] for form in FORMS}
     left: dict[str, list[float]] = {}
     outside: dict[str, float] = {}

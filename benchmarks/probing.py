@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 import tyro
 
 import hqp_grasp as hg
-from hqp_grasp.probe import GeometricProbe, Missed
-from hqp_grasp.trial import TOUCH_RANK, Record
+from hqp_grasp.experiments.trial import TOUCH_RANK, Record
+from hqp_grasp.grasp import Missed
+from hqp_grasp.touch.geometric import GeometricProbe
 
 WANTED = 500  # touches a second on one core
 
@@ -64,7 +64,7 @@ def main(seed: int = 0, trials: int = 5, probes: int = 40, solver: str = "proxqp
     """
     scene = hg.Scene(robot="wam_bhand", object=hg.Cylinder(radius=0.05))
     robot = scene.articulated
-    stack = hg.Stack.from_letters("fmk").within(hg.StepLimit(), hg.ConfigurationLimit(robot))
+    stack = hg.stack_of("fmk").within(hg.StepLimit(), hg.ConfigurationLimit(robot))
     hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK)
     trial = hg.Trial(scene, stack, probes, hqp=hqp)
     trial.run((seed, trials))  # compiles and fills caches
@@ -79,17 +79,14 @@ def main(seed: int = 0, trials: int = 5, probes: int = 40, solver: str = "proxqp
         cycles += of_cycle
     grasps = [grasp for record in records for grasp in record.grasps]
 
-    data = mujoco.MjData(scene.model)
-
     def kinematics(grasp: hg.Grasp) -> None:
-        robot.place(data, grasp.q)
-        robot.jacobian(data)
-        robot.hessian(data)
+        robot.jacobian(grasp.q)
+        robot.hessian(grasp.q)
 
     levels = [stack.levels(grasp) for grasp in grasps]
     each = iter(levels)
     rows = {
-        "place, Jacobians, Hessian": timed(kinematics, grasps),
+        "Jacobians, Hessian": timed(kinematics, grasps),
         "laws, from a grasp": timed(stack.law_levels, grasps),
         "limits, from a grasp": timed(stack.limit_levels, grasps),
         f"hierarchy solve ({solver})": timed(lambda _: hqp.solve(next(each)), grasps),

@@ -37,7 +37,7 @@ import numpy as np
 import tyro
 
 import hqp_grasp as hg
-from hqp_grasp.ik import solve_ik
+from hqp_grasp.control.ik import solve_ik
 
 try:
     import pink

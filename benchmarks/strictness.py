@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from hqp_grasp import HQP, Robot, RobotDescription, Solution
-from hqp_grasp.ik import ik_levels
+from hqp_grasp.control.ik import ik_levels
 
 DT = 0.01  # [s]
 OUTSIDE = 0.1  # [rad] beyond its range, where a joint starts in the second case

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 import hqp_grasp as hg
-from hqp_grasp import active_set, hqp
+from hqp_grasp.hierarchy import active_set, hqp
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from problems import three_level

@@ -1,5 +1,7 @@
 """Grasping by touch, with control laws in strict order and within a robot's limits."""
 
+from hqp_grasp.control.ik import ik_levels, solve_ik
+from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
 from hqp_grasp.errors import (
     HqpGraspError,
     InputError,
@@ -9,31 +11,36 @@ from hqp_grasp.errors import (
     SingularTaskError,
     SolverError,
 )
-from hqp_grasp.grasp import Contact, Grasp
-from hqp_grasp.hqp import HQP, solvers
-from hqp_grasp.ik import ik_levels, solve_ik
-from hqp_grasp.level import Level, LevelReport, Solution
-from hqp_grasp.limits import ConfigurationLimit, Limit, MinkLimit, StepLimit, VelocityLimit
-from hqp_grasp.probe import GeometricProbe, Miss, Missed, Probe
-from hqp_grasp.projection import Projection
-from hqp_grasp.robot import Robot, RobotDescription
-from hqp_grasp.scene import Cylinder, Prism, Scene
-from hqp_grasp.stack import Stack
-from hqp_grasp.study import Study
+from hqp_grasp.experiments.study import Study
+from hqp_grasp.experiments.trial import Record, Trial
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
+from hqp_grasp.hierarchy.hqp import HQP, solvers
+from hqp_grasp.hierarchy.level import Level, LevelReport, Solution
+from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.tasks import (
+    ContactSpaceTask,
     ContactTask,
     ForceTask,
     KinematicTask,
+    Limit,
+    MinkLimit,
     MomentTask,
     PostureTask,
+    Priority,
+    Stack,
     Task,
+    stack_of,
 )
-from hqp_grasp.trial import Record, Trial
+from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.touch.probe import Probe
+from hqp_grasp.world.robot import Robot, RobotDescription
+from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
 __all__ = [
     "HQP",
     "ConfigurationLimit",
     "Contact",
+    "ContactSpaceTask",
     "ContactTask",
     "Cylinder",
     "ForceTask",
@@ -51,6 +58,7 @@ __all__ = [
     "ModelError",
     "MomentTask",
     "PostureTask",
+    "Priority",
     "Prism",
     "Probe",
     "Projection",
@@ -72,4 +80,5 @@ __all__ = [
     "ik_levels",
     "solve_ik",
     "solvers",
+    "stack_of",
 ]

@@ -1,5 +1,7 @@
 """What can go wrong, each with the way out in its message."""
 
+import math
+
 
 class HqpGraspError(Exception):
     """Any error that hqp_grasp raises on purpose."""
@@ -35,6 +37,17 @@ def number(name: str, value: object) -> float:
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be a number; got {value!r}") from error
+
+
+def positive(name: str, value: object) -> float:
+    """Return `value` as a finite float above zero, else raise InputError."""
+    try:
+        found = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be a number above 0; got {value!r}") from error
+    if not 0.0 < found < math.inf:
+        raise InputError(f"{name} must be finite and above 0; got {found}")
+    return found
 
 
 def one_of(name: str, value: object, choices: object) -> str:

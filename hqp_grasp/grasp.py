@@ -1,9 +1,10 @@
-"""What touch told us: the contacts of a hand on an object, as plain arrays."""
+"""What touch told us: contacts on an object as plain arrays, or why there are none."""
 
 from __future__ import annotations
 
 import operator
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
@@ -153,3 +154,23 @@ class Grasp:
     def contact_jacobian(self, i: int) -> np.ndarray:
         """∂x_i/∂q (3, n) [m/rad] of contact i."""
         return self._J3[i]
+
+    def normal_jacobian(self) -> np.ndarray:
+        """n_iᵀ ∂x_i/∂q, one row per contact (k, n) [m/rad]: motion off the surface."""
+        return (self.normals[:, None, :] @ self._J3)[:, 0]
+
+
+class Miss(Enum):
+    """Why a probe ended without a grasp."""
+
+    NO_TOUCH = "a finger closed without touching"
+    INSIDE = "a fingertip began inside the object"
+    OTHER_LINK = "another link touches the object"
+
+
+@dataclass(frozen=True)
+class Missed:
+    """A probe that brought no grasp."""
+
+    reason: Miss
+    where: str  # the contact point or link

@@ -5,7 +5,7 @@ python scenarios/cylinder.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs
 """
 
 import hqp_grasp as hg
-from hqp_grasp.scenario import main
+from hqp_grasp.experiments.scenario import main
 
 # As tall as a can: the hand ends above it, with the palm and the links clear of its top.
 scene = hg.Scene(robot="wam_bhand", object=hg.Cylinder(radius=0.05, height=0.12))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hqp_grasp.grasp import Grasp
-from hqp_grasp.tasks.task import Task
+from hqp_grasp.tasks.stack import Task
 
 
 @dataclass(frozen=True)
@@ -24,4 +24,4 @@ class ContactTask(Task):
 
     def jacobian(self, grasp: Grasp) -> np.ndarray:
         """n_iᵀ ∂x_i/∂q, one row per contact (k, n) [m/rad]."""
-        return (grasp.normals[:, None, :] @ grasp._J3)[:, 0]
+        return grasp.normal_jacobian()

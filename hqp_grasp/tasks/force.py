@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hqp_grasp.errors import positive
 from hqp_grasp.grasp import Grasp
-from hqp_grasp.tasks.task import ContactSpaceTask, positive, side_by_side, tangent_projectors
+from hqp_grasp.tasks.contact_space import ContactSpaceTask, side_by_side, tangent_projectors
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, SingularTaskError, one_of
 from hqp_grasp.grasp import Grasp
-from hqp_grasp.tasks.task import Task
+from hqp_grasp.tasks.stack import Task
 
 ALIGNED = 1e-9  # [rad] nearer to its minimum than this, an error has no direction of descent
 STILL = 1e-9  # [m/rad] flexion joints that move their contact slower than this do not move it

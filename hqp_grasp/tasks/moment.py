@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp, as_array
-from hqp_grasp.tasks.task import (
+from hqp_grasp.tasks.contact_space import (
     ContactSpaceTask,
     cross_matrices,
     side_by_side,

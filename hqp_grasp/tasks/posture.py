@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp, as_array
-from hqp_grasp.tasks.task import Task
+from hqp_grasp.tasks.stack import Task
 
 
 @dataclass(frozen=True)

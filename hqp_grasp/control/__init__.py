@@ -1,0 +1,1 @@
+"""From laws and limits to the next step."""

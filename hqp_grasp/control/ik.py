@@ -1,0 +1,171 @@
+"""Differential inverse kinematics in strict priority, for mink's tasks, limits and constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mink
+import numpy as np
+from mink.tasks import BaseTask
+
+from hqp_grasp.errors import InputError
+from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks.limit import Priority
+
+Tasks = BaseTask | Sequence[BaseTask]  # that share a level
+
+CAPS = (mink.VelocityLimit, mink.FreeJointVelocityLimit)
+ROUNDING = 1e-12  # [–] share of a dense Hessian's largest eigenvalue that counts as zero
+
+
+def solve_ik(
+    configuration: mink.Configuration,
+    priorities: Sequence[Tasks],
+    dt: float,
+    solver: str = "proxqp",
+    damping: float = 0.0,
+    safety_break: bool = False,
+    limits: Sequence[mink.Limit] | None = None,
+    constraints: Sequence[mink.Task] | None = None,
+) -> np.ndarray:
+    """Return the velocity (nv,) that serves `priorities` in order, the first above all others.
+
+    The arguments of mink.solve_ik in its order, with lists of tasks in the place of tasks; what
+    each means is said at `ik_levels`. Nothing is infeasible: what cannot be met is met as nearly
+    as the levels above allow. HQP(solver).solve(ik_levels(…)) tells which, and by how much.
+
+    Raises InputError for malformed arguments, and with `safety_break`, as mink does,
+    mink.NotWithinConfigurationLimits for a start outside the joint ranges.
+    """
+    if safety_break:
+        configuration.check_limits(safety_break=True)
+    hqp = HQP(solver)
+    levels = ik_levels(configuration, priorities, dt, damping, limits, constraints, hqp)
+    return hqp.solve(levels).x / dt
+
+
+def ik_levels(
+    configuration: mink.Configuration,
+    priorities: Sequence[Tasks],
+    dt: float,
+    damping: float = 0.0,
+    limits: Sequence[mink.Limit] | None = None,
+    constraints: Sequence[mink.Task] | None = None,
+    hqp: HQP | None = None,
+) -> list[Level]:
+    """Return the levels over Δq (nv,): speed caps, joint ranges, other limits, constraints, tasks.
+
+    Each limit and each constraint is a level of its own, those of a kind in the order given; where
+    all can be met that order plays no part. `limits` None means mink's ConfigurationLimit.
+
+    A priority is mink's objective ‖W Δq − e‖² + μ‖Δq‖², costs and gains included. μ, which is
+    `damping` plus the tasks' Levenberg–Marquardt terms, would leave no freedom below: where
+    μ > 0, `hqp` first solves the damped priority under the levels above, and the level asks for
+    the W Δq found. A task with a dense Hessian H and slope c gives the rows √H Δq = −√H⁺ c.
+    """
+    if not (np.isfinite(dt) and dt > 0.0):
+        raise InputError(f"dt must be a time above 0 s; got {dt}")
+    if not (np.isfinite(damping) and damping >= 0.0):
+        raise InputError(f"damping must be at least 0; got {damping}")
+    nv = configuration.nv
+    if limits is None:
+        limits = [mink.ConfigurationLimit(configuration.model)]
+    for limit in limits:
+        _require(limit, mink.Limit, "limits")
+    levels = [_limit_level(limit, configuration, dt) for limit in sorted(limits, key=_priority)]
+    for task in constraints or ():
+        _require(task, mink.Task, "constraints")
+        J, error = task.compute_jacobian(configuration), task.compute_error(configuration)
+        _require_width(task, J, nv)
+        levels.append(Level.equal(J, -task.gain * error, type(task).__name__))
+    if isinstance(priorities, BaseTask):
+        raise InputError("priorities must be a list of tasks or of lists of tasks; got one task")
+    dampings = [0.0] * len(levels)
+    for priority in priorities:
+        tasks = [priority] if isinstance(priority, BaseTask) else list(priority)
+        W, e, mu = _rows(tasks, configuration)
+        levels.append(Level.equal(W, e, " + ".join(type(task).__name__ for task in tasks)))
+        dampings.append(mu + damping)
+    return (hqp or HQP()).damped(levels, dampings) if any(dampings) else levels
+
+
+def _priority(limit: mink.Limit) -> Priority:
+    if isinstance(limit, CAPS):
+        return Priority.CAP
+    return Priority.RANGE if isinstance(limit, mink.ConfigurationLimit) else Priority.CLEARANCE
+
+
+def _limit_level(limit: mink.Limit, configuration: mink.Configuration, dt: float) -> Level:
+    """Rows G Δq ≤ h; those of caps as shares of the cap [–]; opposite rows become one."""
+    name, nv = type(limit).__name__, configuration.nv
+    G, h = limit.compute_qp_inequalities(configuration, dt)
+    if G is None or h is None:
+        G, h = np.zeros((0, nv)), np.zeros(0)
+    _require_width(limit, G, nv)
+    kept = h != np.inf
+    if not kept.all():
+        G, h = G[kept], h[kept]
+    if isinstance(limit, CAPS):
+        unit = np.where(h > 0.0, h, 1.0)
+        G, h = G / unit[:, None], h / unit
+    half = len(h) // 2
+    up, down = h[:half], -h[half:]
+    if len(h) == 2 * half and (G[:half] == -G[half:]).all() and (down <= up).all():
+        return Level(G[:half], down, up, name)
+    return Level(G, np.full(len(h), -np.inf), h, name)
+
+
+def _rows(
+    tasks: Sequence[BaseTask], configuration: mink.Configuration
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """W (m, nv), e (m,) and μ of tasks at equal priority."""
+    Ws, es, mu = [], [], 0.0
+    for task in tasks:
+        _require(task, BaseTask, "priorities")
+        W, e, own = task.compute_qp_residual(configuration) or _dense(task, configuration)
+        _require_width(task, W, configuration.nv)
+        asks = W.any(axis=1) | (e != 0.0)
+        if not asks.all():  # rows without a cost ask for nothing
+            W, e = W[asks], e[asks]
+        Ws.append(W)
+        es.append(e)
+        mu += own
+    if len(tasks) == 1:
+        return Ws[0], es[0], mu
+    return np.concatenate([np.zeros((0, configuration.nv)), *Ws]), np.concatenate([[], *es]), mu
+
+
+def _dense(
+    task: BaseTask, configuration: mink.Configuration
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rows whose least squares is ½ Δqᵀ H Δq + cᵀ Δq up to a constant: H = WᵀW, c = −Wᵀe."""
+    name = type(task).__name__
+    H, c = task.compute_qp_objective(configuration)
+    if not (np.isfinite(H).all() and np.isfinite(c).all()):
+        raise InputError(f"{name}: its objective (H, c) is not finite")
+    value, V = np.linalg.eigh(H)
+    zero = ROUNDING * np.abs(value).max(initial=0.0)
+    kept = value > zero
+    if (value < -zero).any():
+        raise InputError(f"{name}: its Hessian has the negative eigenvalue {value[0]:.1e}")
+    slope = V.T @ c
+    if (np.abs(slope[~kept]) > np.sqrt(ROUNDING) * np.abs(slope).max(initial=0.0)).any():
+        raise InputError(f"{name}: its objective falls for ever, c is outside the range of H")
+    root = np.sqrt(value[kept])
+    return root[:, None] * V[:, kept].T, -slope[kept] / root, 0.0
+
+
+def _require(value: object, kind: type, argument: str) -> None:
+    if not isinstance(value, kind):
+        raise InputError(
+            f"{argument} must hold mink.{kind.__name__} objects; got {type(value).__name__}"
+        )
+
+
+def _require_width(owner: object, rows: np.ndarray, nv: int) -> None:
+    if rows.ndim != 2 or rows.shape[1] != nv:
+        raise InputError(
+            f"{type(owner).__name__} has rows of shape {rows.shape}, the configuration {nv} "
+            "degrees of freedom; was it built for another model?"
+        )

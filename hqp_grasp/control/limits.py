@@ -1,0 +1,83 @@
+"""What a step may not do: caps on its length, and the joints' ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hqp_grasp.errors import InputError, number
+from hqp_grasp.grasp import Grasp, as_array
+from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks.limit import Limit, Priority
+from hqp_grasp.world.robot import Robot
+
+
+@dataclass(frozen=True)
+class StepLimit(Limit):
+    """Caps on one step: |x_j| ≤ joint and |(J x)_a| ≤ contact, along each world axis a.
+
+    Rows are shares of the cap [–], so that radians and metres stand side by side.
+    """
+
+    joint: float = 0.35  # [rad]
+    contact: float = 0.03  # [m]
+    priority = Priority.CAP
+
+    def __post_init__(self) -> None:
+        for name in ("joint", "contact"):
+            if not number(f"StepLimit.{name} must be above 0: it", getattr(self, name)) > 0.0:
+                raise InputError(f"StepLimit.{name} must be above 0; got {getattr(self, name)}")
+
+    def level(self, grasp: Grasp) -> Level:
+        rows = [np.eye(grasp.n) / self.joint] if np.isfinite(self.joint) else []
+        if np.isfinite(self.contact):
+            rows.append(grasp.jacobian / self.contact)
+        A = np.concatenate(rows) if rows else np.zeros((0, grasp.n))
+        one = np.ones(len(A))
+        return Level(A, -one, one, "step")
+
+
+@dataclass(frozen=True, eq=False)
+class VelocityLimit(Limit):
+    """|x_j| ≤ v_j dt; rows are shares of it [–]."""
+
+    velocity: np.ndarray  # v (n,) [rad/s]
+    dt: float  # [s] a probe may take
+    priority = Priority.CAP
+
+    def __post_init__(self) -> None:
+        velocity = as_array("VelocityLimit.velocity", self.velocity, (None,))
+        object.__setattr__(self, "velocity", velocity)
+        if not (velocity > 0.0).all() or not (np.isfinite(self.dt) and self.dt > 0.0):
+            raise InputError("VelocityLimit needs velocities and dt above 0")
+
+    def level(self, grasp: Grasp) -> Level:
+        if len(self.velocity) != grasp.n:
+            raise InputError(
+                f"VelocityLimit has {len(self.velocity)} velocities; the grasp has {grasp.n} joints"
+            )
+        one = np.ones(grasp.n)
+        return Level(np.diag(1.0 / (self.velocity * self.dt)), -one, one, "velocity")
+
+
+@dataclass(frozen=True, eq=False)
+class ConfigurationLimit(Limit):
+    """Every joint, independent or coupled, stays in its range [rad].
+
+    From outside a range x walks back as fast as the caps allow.
+    """
+
+    robot: Robot
+    priority = Priority.RANGE
+
+    def level(self, grasp: Grasp) -> Level:
+        lower, upper = self.robot.lower, self.robot.upper
+        limited = np.isfinite(lower) | np.isfinite(upper)
+        q = grasp.q_full
+        if len(q) != len(lower):
+            raise InputError(
+                f"the grasp has {len(q)} joints, {self.robot.description.name} {len(lower)}"
+            )
+        A = grasp.coupling[limited]  # type: ignore[index]
+        return Level(A, (lower - q)[limited], (upper - q)[limited], "range")

@@ -1,0 +1,1 @@
+"""Trials, studies, scenarios, and what they leave to look at."""

@@ -1,0 +1,67 @@
+"""The figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display is ever needed
+import matplotlib.pyplot as plt
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+
+from hqp_grasp.experiments.trial import CONVERGED_FORCE, CONVERGED_MOMENT
+
+FORCE, MOMENT, ANGLE = "#0072b2", "#d55e00", "#009e73"
+FLOOR = 1e-16  # errors below are drawn here
+
+
+def convergence(table: pa.Table, title: str, path: Path) -> None:
+    """The three errors over the probes, and where the hand began and ended (Figures 3 and 4)."""
+    force, moment, angle, adduction, elevation = (
+        _by_trial(table, name)
+        for name in ("eps_f", "eps_m", "eps_k", "adduction_deg", "elevation_deg")
+    )
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    _spread(left, force, FORCE, r"$\varepsilon_f$ [N²]")
+    _spread(left, 1e3 * np.sqrt(moment), MOMENT, r"$\sqrt{\varepsilon_m}$ [mm·N]")
+    left.axhline(CONVERGED_FORCE, color=FORCE, ls=":", lw=1)
+    left.axhline(1e3 * CONVERGED_MOMENT, color=MOMENT, ls=":", lw=1)
+    left.set(yscale="log", xlabel="probe", title="net force and moment")
+    left.legend()
+    _spread(middle, angle, ANGLE, "")
+    middle.set(xlabel="probe", ylabel=r"$\varepsilon_k$ [rad]", ylim=(0.0, None))
+    middle.set_title("angle between flexion and normal")
+    right.plot(adduction[:, 0], elevation[:, 0], "k.", label="start")
+    right.plot(_last(adduction), _last(elevation), "o", mfc="none", color=MOMENT, label="end")
+    right.set(xlabel="adduction [°]", ylabel="elevation [°]", title="posture of the hand")
+    right.legend()
+    figure.suptitle(title)
+    part = path.with_suffix(".part.png")
+    figure.savefig(part, dpi=130)
+    plt.close(figure)
+    part.replace(path)
+
+
+def _by_trial(table: pa.Table, name: str) -> np.ndarray:
+    """One column as (trials, probes), NaN where missing."""
+    trials = len(table.column("trial").unique())
+    return table.column(name).to_numpy().astype(float).reshape(trials, -1)
+
+
+def _last(values: np.ndarray) -> list[float]:
+    """The last number of each trial, NaN where it has none: not every robot has an adduction."""
+    return [next((v for v in reversed(row) if np.isfinite(v)), np.nan) for row in values]
+
+
+def _spread(axes: Axes, values: np.ndarray, color: str, label: str) -> None:
+    """Median, and the range of all trials around it."""
+    probes = np.arange(values.shape[1])
+    some = np.isfinite(values).any(axis=0)
+    shown = np.maximum(values[:, some], FLOOR)
+    axes.fill_between(
+        probes[some], np.nanmin(shown, axis=0), np.nanmax(shown, axis=0), color=color, alpha=0.2
+    )
+    axes.plot(probes[some], np.nanmedian(shown, axis=0), color=color, label=label)

@@ -1,0 +1,153 @@
+"""The command line of a scenario: settings in, trials run, a table and a figure out."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+import tyro
+
+from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
+from hqp_grasp.errors import HqpGraspError
+from hqp_grasp.experiments.plots import convergence
+from hqp_grasp.experiments.study import Study
+from hqp_grasp.experiments.trial import CONVERGED_FORCE, CONVERGED_MOMENT, TOUCH_RANK, Trial
+from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.tasks import stack_of
+from hqp_grasp.world.scene import Scene
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to run a scenario; every value has a sensible default."""
+
+    stack: str = "fmk"
+    """Laws in their order, one letter each: f (force), m (moment), k (kinematic)."""
+    trials: int = 40
+    """Random starts."""
+    probes: int = 40
+    """Touches after the first one, in each trial."""
+    seed: int = 0
+    """Trial i draws from SeedSequence([seed, i])."""
+    jobs: int = 2
+    """Processes."""
+    out: Path | None = None
+    """Results folder; a rerun continues it. Default: out/SCENARIO-STACK-FORM."""
+    form: Literal["hierarchy", "clipped", "paper"] = "hierarchy"
+    """hierarchy: strict priorities within limits. clipped: projection, then clipped to the limits.
+    paper: gradients in contact space and SR-inverse (eq. 11-13), then clipped."""
+    kinematic_error: Literal["angle", "eq7"] = "angle"
+    """The kinematic law's error: the angle the paper plots, or its eq. 7 to the letter."""
+    solver: str = "proxqp"
+    """QP solver behind the hierarchy: proxqp, daqp, or any that qpsolvers lists."""
+    joint_cap: float = field(default=StepLimit.joint)
+    """Longest step of a joint [rad]."""
+    contact_cap: float = field(default=StepLimit.contact)
+    """Longest step of a contact along an axis [m]."""
+    landing: bool = True
+    """Correct each step by the hand's own kinematics before it touches."""
+    links: Literal["pass", "block"] = "pass"
+    """Whether links other than the fingertips pass through the object, as in the paper."""
+
+
+def main(name: str, scene: Scene, settings: Settings | None = None) -> None:
+    """Run a scenario from the command line; what is wrong is said in one line."""
+    chosen = settings or tyro.cli(Settings, prog=f"{name}.py", description=_about(name, scene))
+    try:
+        run(name, scene, chosen)
+    except HqpGraspError as error:
+        sys.exit(f"{name}: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\ninterrupted: complete trials are kept, the same command continues")
+
+
+def _about(name: str, scene: Scene) -> str:
+    return (
+        f"{name}: {scene.robot} grasps {scene.object} by touch. Contacts are lifted, displaced "
+        "and placed again until net force, net moment and finger posture are right."
+    )
+
+
+def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
+    """Run, print the table, write DIR/probes.parquet and DIR/convergence.png."""
+    stack = stack_of(settings.stack, settings.kinematic_error)
+    stack = stack.within(
+        StepLimit(settings.joint_cap, settings.contact_cap), ConfigurationLimit(scene.articulated)
+    )
+    trial = Trial(
+        scene=scene,
+        stack=stack,
+        probes=settings.probes,
+        form=settings.form,
+        hqp=HQP(settings.solver, rank_tolerance=TOUCH_RANK),
+        landing=settings.landing,
+        links=settings.links,
+    )
+    out = settings.out or Path("out") / f"{name}-{settings.stack}-{settings.form}"
+    study = Study(trial, settings.trials, settings.seed, settings.jobs)
+    print(f"{name}: {stack.name}, {settings.trials} trials of {settings.probes} probes")
+    table = study.run(out)
+    figure = out / "convergence.png"
+    convergence(table, f"{name}: {stack.name}, {settings.trials} trials", figure)
+    print(summary(table))
+    print(f"\nresults  {out / 'probes.parquet'}\nfigure   {figure}")
+    return table
+
+
+def summary(table: pa.Table) -> str:
+    """What came of the trials, for people."""
+    columns = {n: table.column(n).to_numpy() for n in table.column_names}
+    trials = len(np.unique(columns["trial"]))
+    shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
+    held = shaped["in_contact"][:, -1].astype(bool)
+    force, moment = shaped["eps_f"].astype(float), 1e3 * np.sqrt(shaped["eps_m"].astype(float))
+    good = (force <= CONVERGED_FORCE) & (moment <= 1e3 * CONVERGED_MOMENT)
+    stays = np.flip(np.logical_and.accumulate(np.flip(good, axis=1), axis=1), axis=1)
+    converged = stays.any(axis=1)
+    first = stays.argmax(axis=1)[converged]
+    lines = [f"\n{'':22}{'start':>22}{'end':>22}"]
+    rows = (
+        ("net force², N²", force, "{:.2e}"),
+        ("net moment, mm·N", moment, "{:.2e}"),
+        ("flexion angle, rad", shaped["eps_k"].astype(float), "{:.3f}"),
+        ("adduction, °", shaped["adduction_deg"].astype(float), "{:.2f}"),
+        ("elevation, °", shaped["elevation_deg"].astype(float), "{:.2f}"),
+    )
+    for label, values, form in rows:
+        cells = []
+        for picked in (values[:, 0], values[held, -1]):
+            if not len(picked) or not np.isfinite(picked).all():
+                cells.append("–")
+            elif "°" in label or "rad" in label:
+                cells.append(f"{form.format(picked.mean())} ± {form.format(picked.std())}")
+            else:
+                cells.append(f"{form.format(np.median(picked))} (≤ {form.format(picked.max())})")
+        lines.append(f"{label:22}{cells[0]:>22}{cells[1]:>22}")
+    after = f", after {np.median(first):g} probes (worst {first.max()})" if len(first) else ""
+    lines.append(
+        f"\nconverged{converged.sum():6} of {trials}{after}: "
+        f"ε_f ≤ {CONVERGED_FORCE:g} N², √ε_m ≤ {1e3 * CONVERGED_MOMENT:g} mm·N, kept to the end"
+    )
+    lines.append(f"lost     {(~held).sum():6} of {trials}")
+    steps = shaped["step_share"].astype(float)
+    taken = np.isfinite(steps)
+    active = shaped["limit_active"].astype(bool) & taken
+    lines.append(f"limits   active in {active.sum() / max(1, taken.sum()):.0%} of the steps")
+    lines.append(f"         largest violation {np.nanmax(columns['limit_violation']):g} rad")
+    gap = columns["hqp_projection_gap"].astype(float)
+    if np.isfinite(gap).any():
+        share = np.isfinite(gap).sum() / max(1, taken.sum())
+        lines.append(
+            f"gap      QP − projection ≤ {np.nanmax(gap):.1e} rad, over {share:.0%} of steps"
+        )
+    other = (shaped["other_links"] != "") & shaped["in_contact"].astype(bool)
+    lines.append(
+        f"links    another link is in the object in {other.mean():.1%} of the probes, "
+        f"at the end of {other[:, -1].sum()} trials"
+    )
+    lines.append(f"rejected {shaped['rejected'][:, 0].sum()} draws that could not start")
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Strict hierarchies of least-squares problems: algebra that knows no robot."""

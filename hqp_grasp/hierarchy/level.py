@@ -1,0 +1,182 @@
+"""Priority levels, and solutions that certify themselves: algebra only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+
+import numpy as np
+from numba import njit, types
+
+from hqp_grasp.errors import InputError
+from hqp_grasp.hierarchy.certificate import optimality_faults
+
+CERTIFICATE_TOLERANCE = 1e-8  # [–] row-scaled; what `is_optimal` asks unless told otherwise
+
+
+def _floats(name: str, value: object, ndim: int) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"Level.{name} must be an array of numbers; got {value!r}") from error
+    if array.ndim != ndim:
+        raise InputError(f"Level.{name} must have {ndim} dimension(s); got shape {array.shape}")
+    return array if array.flags.aligned else array.copy()
+
+
+_VECTOR = types.Array(types.float64, 1, "A", readonly=True)  # any strides, never written to
+_MATRIX = types.Array(types.float64, 2, "A", readonly=True)
+
+
+@njit(types.boolean(_MATRIX, _VECTOR, _VECTOR), cache=True, error_model="numpy")
+def _constructs(A, lower, upper):  # type: ignore[no-untyped-def]
+    """Whether all is as `Level` asks; NaN compares false."""
+    m, n = A.shape
+    for i in range(m):
+        if not lower[i] <= upper[i] or lower[i] == np.inf or upper[i] == -np.inf:
+            return False
+        for j in range(n):
+            if not np.isfinite(A[i, j]):
+                return False
+    return True
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Rows lower ≤ A x ≤ upper of one priority level, met in the least-squares sense.
+
+    Rows that contradict one another are no error: the level is resolved to its nearest point.
+    Raises InputError, naming the row, where A is not finite, a bound is NaN, lower > upper,
+    lower = +inf or upper = −inf.
+    """
+
+    A: np.ndarray  # (m, n)
+    lower: np.ndarray  # (m,), −inf where one-sided
+    upper: np.ndarray  # (m,), +inf where one-sided
+    name: str = ""  # what the rows stand for, in reports
+
+    def __post_init__(self) -> None:
+        A = _floats("A", self.A, 2)
+        lower, upper = _floats("lower", self.lower, 1), _floats("upper", self.upper, 1)
+        m = len(A)
+        if lower.shape != (m,) or upper.shape != (m,):
+            raise InputError(
+                f"Level bounds must have one entry for each of the {m} rows of A; "
+                f"lower has {lower.shape}, upper has {upper.shape}"
+            )
+        if not _constructs(A, lower, upper):
+            raise self._fault(A, lower, upper)
+        object.__setattr__(self, "A", A)
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+
+    def _fault(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> InputError:
+        """What keeps the first faulty row from being one."""
+        label = f"Level {self.name!r}" if self.name else "Level"
+        sound = np.isfinite(A).all(axis=1) & (lower <= upper) & (lower < np.inf) & (upper > -np.inf)
+        row = int(np.argmin(sound))
+        low, high = lower[row], upper[row]
+        if not np.isfinite(A[row]).all():
+            return InputError(f"{label}: row {row} of A is not finite: {A[row]}")
+        if np.isnan(low) or np.isnan(high):
+            return InputError(f"{label}: row {row} has a NaN bound: [{low}, {high}]")
+        if low > high:
+            return InputError(f"{label}: row {row} has lower > upper: [{low}, {high}]")
+        return InputError(
+            f"{label}: row {row} asks for an infinite value: [{low}, {high}]; "
+            "use lower = −inf or upper = +inf for a side without bound"
+        )
+
+    @classmethod
+    def equal(cls, A: np.ndarray, b: np.ndarray, name: str = "") -> Level:
+        """Rows A x = b."""
+        b = _floats("b", b, 1)
+        return cls(A, b, b, name)
+
+    @property
+    def is_inequality(self) -> bool:
+        """True where no row is an equality: such a level only limits."""
+        return not bool((self.lower == self.upper).any())
+
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        """w = A x − clip(A x, lower, upper), (m,): zero where the row is met."""
+        value = self.A @ x
+        return value - np.clip(value, self.lower, self.upper)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelReport:
+    """How one level came out."""
+
+    name: str
+    residual: np.ndarray  # (m,) A x − nearest admissible value
+    rank: int  # of its active rows in the freedom left by the levels above
+    status: str  # "met", or "nearest" where the levels above left less than it asks
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The answer to a hierarchy, with the evidence for its optimality."""
+
+    x: np.ndarray  # (n,)
+    levels: tuple[LevelReport, ...]
+    active: np.ndarray  # (M,) int8 per stacked row: −1 at lower, +1 at upper, 2 equality, 0 free
+    multipliers: np.ndarray  # (M, p + 1): column k proves level k, the last that x is the shortest;
+    # 0 where found with many digits: there the certificate finds its own
+    method: str  # the way that found x
+    failed: tuple[str, ...] = ()  # ways tried before whose answers failed the certificate
+    rank_tolerance: float = 0.0  # [–] the user's, 0 for the default rule
+
+    @property
+    def limit_active(self) -> bool:
+        """True where some inequality row holds x at a bound."""
+        return bool((np.abs(self.active) == 1).any())
+
+    def is_optimal(self, levels: Sequence[Level], tol: float = CERTIFICATE_TOLERANCE) -> bool:
+        """True where x is the lexicographic least-squares optimum of `levels`, to `tol`.
+
+        Level k is optimal, given those above, when −A_kᵀ w_k is a combination of the rows above
+        that hold x: of either sign for equalities and rows that cannot be met, pushing inwards
+        for rows at a bound. Where the multipliers at hand do not show it, others are searched by
+        non-negative least squares (degenerate active sets have many); no QP solver takes part.
+        With a rank tolerance of the user's, a level may leave what lies in directions weaker than
+        that.
+        """
+        rows = stack(levels)
+        _, _, faults = optimality_faults(
+            rows.A,
+            rows.lower,
+            rows.upper,
+            rows.offsets,
+            self.x,
+            self.multipliers,
+            tol,
+            self.rank_tolerance,
+        )
+        return not faults
+
+
+@dataclass(frozen=True, eq=False)
+class Stacked:
+    """All levels one above the other: the form in which solvers and certificate read them."""
+
+    A: np.ndarray  # (M, n)
+    lower: np.ndarray  # (M,)
+    upper: np.ndarray  # (M,)
+    offsets: np.ndarray  # (p + 1,) level k owns rows offsets[k]:offsets[k+1]
+
+
+def stack(levels: Sequence[Level]) -> Stacked:
+    """Stack levels; raise InputError where they disagree on the number of unknowns."""
+    if not levels:
+        raise InputError("a hierarchy needs at least one level")
+    try:
+        A = np.concatenate([level.A for level in levels])
+    except ValueError as error:
+        widths = [level.A.shape[1] for level in levels]
+        raise InputError(f"levels disagree on the number of unknowns: {widths}") from error
+    lower = np.concatenate([level.lower for level in levels])
+    upper = np.concatenate([level.upper for level in levels])
+    offsets = np.array([0, *accumulate(len(level.lower) for level in levels)])
+    return Stacked(A, lower, upper, offsets)

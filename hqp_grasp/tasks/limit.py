@@ -1,0 +1,81 @@
+"""What a limit is: inequality rows above every law; mink's limits are taken as they are."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import mink
+import mujoco
+import numpy as np
+
+from hqp_grasp.errors import InputError
+from hqp_grasp.grasp import Grasp
+from hqp_grasp.hierarchy.level import Level
+
+
+class Priority(IntEnum):
+    """Which limits come first: a cap always leaves x = 0, so it can always be kept."""
+
+    CAP = 0
+    RANGE = 1
+    CLEARANCE = 2
+
+
+class Limit(ABC):
+    """Inequality rows over x = Δq, placed above every control law."""
+
+    priority: Priority
+
+    @abstractmethod
+    def level(self, grasp: Grasp) -> Level:
+        """lower ≤ A x ≤ upper at this grasp."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MinkLimit(Limit):
+    """A limit of mink, G Δq_full ≤ h, carried over to the independent joints: G C x ≤ h."""
+
+    limit: mink.Limit
+    model: mujoco.MjModel | None = None  # that the limit speaks of; None: the one it keeps itself
+    dt: float = 1.0  # [s] a probe may take; only velocity limits read it
+
+    def __post_init__(self) -> None:
+        if self.model is None and not isinstance(self.limit, mink.VelocityLimit):
+            model = getattr(self.limit, "model", None)
+            if model is None:
+                raise InputError(
+                    f"{type(self.limit).__name__} keeps no model: pass MinkLimit(limit, model)"
+                )
+            object.__setattr__(self, "model", model)
+
+    def __repr__(self) -> str:
+        # Says all that mink's limit holds, and no address: results folders are told apart by it.
+        kept = {k: v for k, v in vars(self.limit).items() if not k.startswith("_")}
+        text = ", ".join(
+            f"{k}={np.array2string(np.asarray(v), threshold=10**6)}"
+            for k, v in sorted(kept.items())
+            if isinstance(v, (int, float, str, np.ndarray))
+        )
+        return f"MinkLimit({type(self.limit).__name__}({text}), dt={self.dt})"
+
+    @property
+    def priority(self) -> Priority:  # type: ignore[override]
+        if isinstance(self.limit, mink.VelocityLimit | mink.FreeJointVelocityLimit):
+            return Priority.CAP
+        if isinstance(self.limit, mink.ConfigurationLimit):
+            return Priority.RANGE
+        return Priority.CLEARANCE
+
+    def level(self, grasp: Grasp) -> Level:
+        # mink's VelocityLimit reads no configuration, and keeps no model to make one from.
+        configuration: Any = self.model and mink.Configuration(self.model, q=grasp.q_full)
+        G, h = self.limit.compute_qp_inequalities(configuration, self.dt)
+        name = type(self.limit).__name__
+        if G is None or h is None:
+            return Level(np.zeros((0, grasp.n)), np.zeros(0), np.zeros(0), name)
+        A = G @ grasp.coupling
+        kept = np.isfinite(h)
+        return Level(A[kept], np.full(kept.sum(), -np.inf), h[kept], name)

@@ -1,0 +1,172 @@
+"""A control law, and how laws compose in strict order: `>>` is the paper's ▷."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import mink
+import numpy as np
+
+from hqp_grasp.errors import InputError, positive
+from hqp_grasp.grasp import Grasp
+from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks.limit import Limit, MinkLimit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(ABC):
+    """A control law: an error that should vanish, and how it changes with the joints.
+
+    A new law is a subclass with two methods, `error` and `jacobian`. It reads a Grasp and
+    nothing else, and is complete once built.
+    """
+
+    gain: float = 1.0  # [–] share of the error to remove in one probe; 1 is a full Newton step
+    weight: float = 1.0  # [–] scales the rows; matters only beside other tasks on one level
+
+    def __post_init__(self) -> None:
+        for setting in ("gain", "weight"):
+            value = positive(f"{type(self).__name__}.{setting}", getattr(self, setting))
+            object.__setattr__(self, setting, value)
+
+    @property
+    def name(self) -> str:
+        """The law's short name: "force" for ForceTask."""
+        return type(self).__name__.removesuffix("Task").lower()
+
+    @abstractmethod
+    def error(self, grasp: Grasp) -> np.ndarray:
+        """The quantity that should vanish, (r,)."""
+
+    @abstractmethod
+    def jacobian(self, grasp: Grasp) -> np.ndarray:
+        """∂error/∂q (r, n) [unit of the error / rad]."""
+
+    def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
+        """The equality rows (A, b) asked of x = Δq over one probe: jacobian·x = −gain·error."""
+        A = self.weight * self.jacobian(grasp)
+        b = (-self.weight * self.gain) * self.error(grasp)
+        return A, b
+
+    def __rshift__(self, other: Task | Stack) -> Stack:
+        """`a >> b`: b subject to a (the paper's a ▷ b)."""
+        return Stack.of(self) >> other
+
+    def __add__(self, other: Task | Stack) -> Stack:
+        """`a + b`: both at the same priority."""
+        return Stack.of(self) + other
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Laws by priority, the limits above them, and whether contacts stay on their surface.
+
+    ForceTask() >> MomentTask() >> KinematicTask() is φ_f ▷ φ_m ▷ φ_k: left first. `a + b` puts
+    two laws at one priority, `within` adds limits.
+    """
+
+    priorities: tuple[tuple[Task, ...], ...]
+    limits: tuple[Limit, ...] = ()
+    hold_contacts: bool = True  # ContactTask between the limits and the laws
+
+    def __post_init__(self) -> None:
+        full = self.priorities and all(isinstance(p, tuple) and p for p in self.priorities)
+        if not full or not all(isinstance(t, Task) for p in self.priorities for t in p):
+            raise InputError(
+                "Stack.priorities must be tuples of control laws, none of them empty; "
+                f"got {self.priorities!r}"
+            )
+
+    @classmethod
+    def of(cls, task: Task) -> Stack:
+        """A stack of one law."""
+        return cls(((task,),))
+
+    def __rshift__(self, other: Task | Stack) -> Stack:
+        """`a >> b`: b subject to a."""
+        below = other if isinstance(other, Stack) else Stack.of(_task(other))
+        return replace(
+            self,
+            priorities=self.priorities + below.priorities,
+            limits=self.limits + below.limits,
+            hold_contacts=self.hold_contacts and below.hold_contacts,
+        )
+
+    def __add__(self, other: Task | Stack) -> Stack:
+        """`a + b`: b at the priority of the last laws of a."""
+        if isinstance(other, Stack):
+            if len(other.priorities) != 1:
+                raise InputError(
+                    "`+` puts laws at one priority: add a task, or stacks of one level"
+                )
+            beside = other
+        else:
+            beside = Stack.of(_task(other))
+        return replace(
+            self,
+            priorities=(*self.priorities[:-1], self.priorities[-1] + beside.priorities[0]),
+            limits=self.limits + beside.limits,
+            hold_contacts=self.hold_contacts and beside.hold_contacts,
+        )
+
+    def within(self, *limits: Limit | mink.Limit) -> Stack:
+        """The same laws below these limits too; mink's are taken as they are."""
+        taken = []
+        for limit in limits:
+            if isinstance(limit, mink.Limit):
+                limit = MinkLimit(limit)
+            if not isinstance(limit, Limit):
+                raise InputError(f"{limit!r} is no limit of hqp_grasp or mink")
+            taken.append(limit)
+        return replace(self, limits=(*self.limits, *taken))
+
+    @property
+    def name(self) -> str:
+        """The laws' names, "force ▷ moment ▷ kinematic"."""
+        return " ▷ ".join(" + ".join(t.name for t in tasks) for tasks in self.priorities)
+
+    def levels(self, grasp: Grasp) -> list[Level]:
+        """The whole hierarchy: caps, ranges, clearances, contacts, laws."""
+        return self.limit_levels(grasp) + self.law_levels(grasp)
+
+    def limit_levels(self, grasp: Grasp) -> list[Level]:
+        """One level for each priority of limits, caps first."""
+        priorities = sorted({limit.priority for limit in self.limits})
+        return [
+            _joined(limit.level(grasp) for limit in self.limits if limit.priority == priority)
+            for priority in priorities
+        ]
+
+    def law_levels(self, grasp: Grasp) -> list[Level]:
+        """The equalities: no motion along the normals, then each priority's laws."""
+        levels = []
+        if self.hold_contacts:
+            levels.append(Level.equal(grasp.normal_jacobian(), np.zeros(grasp.k), "contact"))
+        for tasks in self.priorities:
+            levels.append(_joined(_level(task, grasp) for task in tasks))
+        return levels
+
+
+def _task(value: object) -> Task:
+    if not isinstance(value, Task):
+        raise InputError(f"{value!r} is no control law: `>>` and `+` take tasks and stacks")
+    return value
+
+
+def _level(task: Task, grasp: Grasp) -> Level:
+    A, b = task.rows(grasp)
+    return Level.equal(A, b, task.name)
+
+
+def _joined(levels: Iterable[Level]) -> Level:
+    parts: Sequence[Level] = list(levels)
+    if len(parts) == 1:
+        return parts[0]
+    return Level(
+        np.concatenate([p.A for p in parts]),
+        np.concatenate([p.lower for p in parts]),
+        np.concatenate([p.upper for p in parts]),
+        " + ".join(p.name for p in parts),
+    )

@@ -1,0 +1,1 @@
+"""The door that a hand fits, and the probes behind it."""

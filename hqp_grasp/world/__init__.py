@@ -1,0 +1,1 @@
+"""The robot and the object, as MuJoCo compiles them."""

@@ -1,0 +1,152 @@
+"""The world of a grasp: one robot and one upright object in one MuJoCo model."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hqp_grasp.errors import InputError, number
+from hqp_grasp.grasp import as_array
+from hqp_grasp.world.robot import Robot, RobotDescription
+
+OBJECT = "object"  # name of the object's body and geom in a scene
+OBJECT_COLOUR = (0.85, 0.55, 0.25, 1.0)
+
+
+def _positive(name: str, value: float) -> None:
+    value = number(name, value)
+    if not (np.isfinite(value) and value > 0.0):
+        raise InputError(f"{name} must be above 0 [m]; got {value}")
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """An upright cylinder."""
+
+    radius: float  # [m]
+    height: float = 0.12  # [m]
+
+    def __post_init__(self) -> None:
+        _positive("Cylinder.radius", self.radius)
+        _positive("Cylinder.height", self.height)
+
+    def add_geom(self, spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
+        """Put the geom into `body`, centred."""
+        body.add_geom(
+            name=OBJECT,
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=[self.radius, self.height / 2.0, 0.0],
+            rgba=OBJECT_COLOUR,
+        )
+
+
+@dataclass(frozen=True)
+class Prism:
+    """An upright prism over a convex polygon, its corners counter-clockwise around the origin."""
+
+    polygon: tuple[tuple[float, float], ...]  # (m, 2) [m]
+    height: float = 0.12  # [m]
+
+    def __post_init__(self) -> None:
+        _positive("Prism.height", self.height)
+        try:
+            corners = np.asarray(self.polygon, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"Prism.polygon must be corners (x, y); got {self.polygon!r}"
+            ) from error
+        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+            raise InputError(f"Prism.polygon needs at least 3 corners (x, y); got {self.polygon!r}")
+        if not np.isfinite(corners).all():
+            raise InputError("Prism.polygon must be finite")
+        edges = np.roll(corners, -1, axis=0) - corners
+        following = np.roll(edges, -1, axis=0)
+        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+        inside = corners[:, 0] * edges[:, 1] - corners[:, 1] * edges[:, 0]
+        bearings = np.arctan2(corners[:, 1], corners[:, 0])
+        once = (np.roll(bearings, -1) < bearings).sum() == 1  # a star goes around twice
+        if not ((turns > 0.0).all() and (inside > 0.0).all() and once):
+            raise InputError(
+                "Prism.polygon must be strictly convex, counter-clockwise, around the origin"
+            )
+        object.__setattr__(self, "polygon", tuple((float(x), float(y)) for x, y in corners))
+
+    @classmethod
+    def regular(cls, sides: int, side: float, height: float = 0.12) -> Prism:
+        """A regular polygon with sides of `side` [m], one corner on the x axis."""
+        _positive("Prism side", side)
+        if sides < 3:
+            raise InputError(f"Prism.regular needs at least 3 sides; got {sides}")
+        angles = 2.0 * np.pi * np.arange(sides) / sides
+        radius = side / (2.0 * np.sin(np.pi / sides))
+        corners = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+        return cls(tuple(map(tuple, corners)), height)
+
+    def add_geom(self, spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
+        """Put the geom into `body`, centred."""
+        half = self.height / 2.0
+        corners = [(x, y, z) for z in (-half, half) for x, y in self.polygon]
+        spec.add_mesh(name=OBJECT, uservert=np.ravel(corners))
+        body.add_geom(
+            name=OBJECT, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=OBJECT, rgba=OBJECT_COLOUR
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A robot and an object that stands still, its middle at `position`."""
+
+    robot: str | Path = "wam_bhand"
+    object: Cylinder | Prism = Cylinder(radius=0.05)
+    position: tuple[float, float, float] = (0.72, 0.0, 0.2)  # [m] world
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.object, Cylinder | Prism):
+            raise InputError(f"unknown object {self.object!r}; choose one of: Cylinder, Prism")
+        try:
+            position = as_array("Scene.position", self.position, (3,))
+        except InputError as error:
+            raise InputError(
+                f"Scene.position must be 3 finite numbers; got {self.position!r}"
+            ) from error
+        object.__setattr__(self, "position", tuple(position.tolist()))
+        description = RobotDescription.load(self.robot)
+        object.__setattr__(self, "_description", description)
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """Robot and object, compiled."""
+        description: RobotDescription = self.__dict__["_description"]
+        spec = description.spec()
+        try:
+            body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
+            self.object.add_geom(spec, body)
+            return spec.compile()
+        except ValueError as error:
+            raise InputError(f"{description.xml.name} does not compile: {error}") from error
+
+    @cached_property
+    def articulated(self) -> Robot:
+        """The robot as it stands in this scene's model."""
+        return Robot(self.__dict__["_description"], self.model)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the compiled model: a robot's folder may change and keep its name."""
+        model = self.model
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        return hashlib.sha256(buffer.tobytes()).hexdigest()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled models stay in their process; the value is what travels.
+        return {"robot": self.robot, "object": self.object, "position": self.position}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.__post_init__()

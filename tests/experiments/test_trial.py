@@ -1,0 +1,444 @@
+"""The closed loop: what a trial promises for every seed, and what it does when touch goes wrong."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+
+from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
+from hqp_grasp.errors import InputError, ReachError
+from hqp_grasp.experiments import start
+from hqp_grasp.experiments.trial import (
+    CLIP_TOLERANCE,
+    COLUMNS,
+    SHARES,
+    TOUCH_RANK,
+    Trial,
+    clip_to_limits,
+)
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
+from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.hierarchy.projection import Projection
+from hqp_grasp.tasks import ForceTask, stack_of
+from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.world.scene import Scene
+
+SEEDS = (0, 1, 2)
+PROBES = 10
+GAP = 1e-8  # [rad] asked for
+TIMINGS = {"solve_us"}
+MISSED = Missed(Miss.NO_TOUCH, "finger_2")
+
+
+class Hand:
+    """A probe that feels what another feels, `touches` times; then it misses. It keeps targets."""
+
+    def __init__(self, inner, touches=10**9, first=None):
+        self.inner, self.touches, self.first, self.targets = inner, touches, first, []
+
+    def touch(self, q_target):
+        self.targets.append(np.array(q_target))
+        if len(self.targets) > self.touches:
+            return MISSED
+        if self.first is not None and len(self.targets) == 1:
+            return self.first
+        return self.inner.touch(q_target)
+
+
+class Replay:
+    """A probe that returns these, one after the other, whatever it is asked."""
+
+    def __init__(self, *outcomes):
+        self.outcomes, self.targets = list(outcomes), []
+
+    def touch(self, q_target):
+        self.targets.append(np.array(q_target))
+        return self.outcomes.pop(0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def stack():
+    return stack_of("fmk")
+
+
+@pytest.fixture(scope="module")
+def trial(scene, stack):
+    return Trial(scene, stack, probes=PROBES)
+
+
+@pytest.fixture(scope="module")
+def records(trial):
+    return {seed: trial.run(seed) for seed in SEEDS}
+
+
+def but_timings(row):
+    return {name: value for name, value in row.items() if name not in TIMINGS}
+
+
+# ---------------------------------------------------------------- every seed
+
+
+def test_one_seed_gives_bitwise_one_record(records, stack):
+    again = Trial(Scene(), stack, probes=PROBES).run((SEEDS[1],))
+    before = records[SEEDS[1]]
+    assert [*map(but_timings, again.rows)] == [*map(but_timings, before.rows)]
+    assert (again.seed, again.rejected) == (before.seed, before.rejected)
+    for one, other in zip(again.grasps, before.grasps, strict=True):
+        np.testing.assert_array_equal(one.q, other.q)
+
+
+def test_a_trial_does_not_depend_on_those_before_it_with_the_same_probe(trial, scene, records):
+    probe = GeometricProbe(scene)
+    trial.run(SEEDS[2], probe)
+    again = trial.run(SEEDS[0], probe)
+    assert [*map(but_timings, again.rows)] == [*map(but_timings, records[SEEDS[0]].rows)]
+
+
+def test_different_seeds_give_different_starts(records):
+    starts = {record.rows[0]["adduction_deg"] for record in records.values()}
+    assert len(starts) == len(SEEDS)
+
+
+def test_rows_are_the_first_touch_and_one_for_each_probe(records):
+    for record in records.values():
+        assert len(record.rows) == PROBES + 1 == len(record.grasps)
+        assert all(set(row) == set(COLUMNS) for row in record.rows)
+        assert not record.lost
+
+
+def test_no_step_led_to_the_first_touch(records):
+    for record in records.values():
+        first = record.rows[0]
+        assert first["in_contact"] and first["outcome"] == "touch"
+        assert not first["limit_active"]
+        for name in ("step_share", "hqp_projection_gap", "solve_us", "method"):
+            assert first[name] is None
+        for row in record.rows[1:]:
+            assert row["step_share"] in SHARES and row["solve_us"] > 0.0 and row["method"]
+
+
+def test_errors_fall_and_every_trial_converges(records):
+    for record in records.values():
+        force, moment = record.column("eps_f"), np.sqrt(record.column("eps_m"))
+        assert record.converged_at is not None and record.converged_at <= PROBES
+        assert force[-1] <= 1e-5 < force[0]
+        assert moment[-1] <= 5e-4 < moment[0]
+
+
+def test_no_joint_is_ever_outside_its_range(records, scene):
+    robot = scene.articulated
+    for record in records.values():
+        assert set(record.column("limit_violation")) == {0.0}
+        assert max(robot.violation(grasp.q) for grasp in record.grasps) == 0.0
+
+
+def test_hierarchy_and_projection_agree_wherever_no_limit_is_active(records):
+    compared = 0
+    for record in records.values():
+        for row in record.rows[1:]:
+            assert (row["hqp_projection_gap"] is None) == row["limit_active"]
+            if not row["limit_active"]:
+                assert row["hqp_projection_gap"] <= GAP
+                compared += 1
+    assert compared > 0
+
+
+def test_with_wide_caps_nearly_every_step_is_compared(scene, stack, records):
+    wide = stack.within(StepLimit(2.0, 0.5), ConfigurationLimit(scene.articulated))
+    probe = Hand(GeometricProbe(scene), first=records[SEEDS[0]].grasps[-1])
+    rows = Trial(scene, wide, probes=5).run(SEEDS[0], probe).rows
+    assert all(row["hqp_projection_gap"] <= GAP for row in rows[1:])
+
+
+def test_errors_in_the_rows_are_those_of_the_grasps(records):
+    record = records[SEEDS[0]]
+    for row, grasp in zip(record.rows, record.grasps, strict=True):
+        f = -grasp.normals.sum(axis=0)
+        lever = grasp.positions - grasp.positions.mean(axis=0)
+        m = np.cross(lever, -grasp.normals).sum(axis=0)
+        velocity = np.array(
+            [grasp.contact_jacobian(i)[:, c.flexion[0]] for i, c in enumerate(grasp.contacts)]
+        )
+        along = np.abs((velocity * grasp.normals).sum(axis=1))
+        angle = np.arccos(np.minimum(1.0, along / np.linalg.norm(velocity, axis=1)))
+        assert row["eps_f"] == pytest.approx(f @ f, rel=1e-9, abs=1e-15)
+        assert row["eps_m"] == pytest.approx(m @ m, rel=1e-9, abs=1e-15)
+        assert row["eps_k"] == pytest.approx(angle.mean(), rel=1e-6)
+        assert row["eps_k_eq7"] == pytest.approx(along.sum(), rel=1e-9)
+
+
+def test_a_column_is_asked_for_by_a_valid_name(records):
+    with pytest.raises(InputError, match=r"unknown column 'eps'.*eps_f, eps_m"):
+        records[SEEDS[0]].column("eps")
+
+
+# ---------------------------------------------------------------- forms
+
+
+@pytest.mark.parametrize("form", ["clipped", "paper"])
+def test_every_form_begins_with_the_same_touch_and_descends(scene, stack, records, form):
+    record = Trial(scene, stack, probes=PROBES, form=form).run(SEEDS[0])
+    assert record.rows[0] == records[SEEDS[0]].rows[0]
+    np.testing.assert_array_equal(record.grasps[0].q, records[SEEDS[0]].grasps[0].q)
+    assert all(row["hqp_projection_gap"] is None for row in record.rows)
+    assert set(record.column("limit_violation")) == {0.0}
+    force = record.column("eps_f")
+    assert force[-1] < 0.1 * force[0]
+
+
+def test_without_landing_short_steps_descend_too(scene, stack, records):
+    short = stack.within(StepLimit(0.05, 0.005), ConfigurationLimit(scene.articulated))
+    record = Trial(scene, short, probes=PROBES, landing=False).run(SEEDS[0])
+    assert record.rows[0] == records[SEEDS[0]].rows[0]
+    assert not record.lost
+    assert record.rows[-1]["eps_f"] < 0.5 * record.rows[0]["eps_f"]
+    assert set(record.column("limit_violation")) == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"form": "hirarchy"}, r"unknown form 'hirarchy'.*hierarchy, clipped, paper"),
+        ({"links": "stop"}, r"unknown links 'stop'.*pass, block"),
+        ({"probes": 0}, r"at least 1 probe; got 0"),
+    ],
+)
+def test_a_wrong_setting_is_named_with_the_valid_ones(scene, stack, setting, message):
+    with pytest.raises(InputError, match=message):
+        Trial(scene, stack, **setting)
+
+
+def test_an_object_out_of_reach_is_named(monkeypatch, stack):
+    monkeypatch.setattr(start, "MAX_DRAWS", 2)
+    with pytest.raises(ReachError, match="move the object"):
+        Trial(Scene(position=(3.0, 0.0, 0.2)), stack, probes=2).run(0)
+
+
+# ---------------------------------------------------------------- misses
+
+
+def test_a_miss_halves_the_step_twice_then_the_trial_is_lost(scene, stack, records):
+    first, second = records[SEEDS[0]].grasps[:2]
+    hand = Replay(first, second, MISSED, MISSED, MISSED)
+    record = Trial(scene, stack, probes=6, landing=False).run(SEEDS[0], hand)
+    steps = [target - second.q for target in hand.targets[2:]]
+    assert len(steps) == len(SHARES) == 3 and np.abs(steps[0]).max() > 1e-3
+    for share, step in zip(SHARES, steps, strict=True):
+        np.testing.assert_allclose(step, share * steps[0], atol=1e-14)
+    assert record.lost and record.converged_at is None
+    assert len(record.rows) == 7 and len(record.grasps) == 2
+    assert [row["in_contact"] for row in record.rows] == [True, True] + 5 * [False]
+
+
+def test_the_row_of_a_loss_tells_the_reason_and_later_rows_are_empty(scene, stack, records):
+    first = records[SEEDS[0]].grasps[0]
+    hand = Replay(first, MISSED, Missed(Miss.INSIDE, "finger_1"), MISSED)
+    rows = Trial(scene, stack, probes=3).run(SEEDS[0], hand).rows
+    assert rows[1]["outcome"] == f"{Miss.NO_TOUCH.value} (finger_2)"
+    assert rows[1]["step_share"] == SHARES[-1] and rows[1]["method"]
+    assert rows[1]["limit_violation"] == 0.0
+    errors = ("eps_f", "eps_m", "eps_k", "eps_k_eq7", "adduction_deg", "elevation_deg")
+    assert all(rows[1][name] is None for name in errors)
+    for row in rows[2:]:
+        assert row["in_contact"] is False and row["limit_active"] is False
+        told = {name for name, value in row.items() if value not in (None, False, 0.0, "")}
+        assert told == set()
+
+
+@pytest.mark.parametrize("misses", [1, 2])
+def test_a_shorter_step_that_touches_carries_the_trial_on(scene, stack, records, misses):
+    first, second = records[SEEDS[0]].grasps[:2]
+    hand = Replay(first, *[MISSED] * misses, second, first)
+    record = Trial(scene, stack, probes=2).run(SEEDS[0], hand)
+    assert not record.lost
+    assert [row["step_share"] for row in record.rows] == [None, SHARES[misses], 1.0]
+    np.testing.assert_array_equal(record.grasps[1].q, second.q)
+
+
+def test_a_trial_that_is_lost_keeps_what_it_felt_before(trial, scene, records):
+    full = Hand(GeometricProbe(scene))
+    trial.run(SEEDS[1], full)
+    started = len(full.targets) - PROBES  # touches that the start took
+    hand = Hand(GeometricProbe(scene), touches=started + 4)
+    record = trial.run(SEEDS[1], hand)
+    assert len(hand.targets) == started + 4 + len(SHARES)
+    kept = [*map(but_timings, record.rows[:5])]
+    assert kept == [*map(but_timings, records[SEEDS[1]].rows[:5])]
+    assert not any(row["in_contact"] for row in record.rows[5:])
+
+
+# ---------------------------------------------------------------- a hand of another kind
+
+
+class SensedHand:
+    """What a driver of a real hand would tell: wrenches, confidence, noisy normals, no Hessian."""
+
+    def __init__(self, scene):
+        self.robot, self.inner = scene.articulated, GeometricProbe(scene)
+        self.rng = np.random.default_rng(0)
+
+    def touch(self, q_target):
+        felt = self.inner.touch(q_target)
+        if isinstance(felt, Missed):
+            return felt
+        contacts = []
+        for contact in felt.contacts:
+            normal = contact.normal + 1e-3 * self.rng.standard_normal(3)
+            normal /= np.linalg.norm(normal)
+            contacts.append(
+                Contact(
+                    contact.position,
+                    normal,
+                    flexion=contact.flexion,
+                    wrench=[*-normal, 0.0, 0.0, 0.0],
+                    confidence=0.9,
+                )
+            )
+        return Grasp(
+            felt.q, contacts, felt.jacobian, coupling=self.robot.coupling, offset=self.robot.offset
+        )
+
+
+def test_a_probe_of_another_kind_is_all_that_a_real_hand_needs(scene):
+    trial = Trial(scene, stack_of("fm"), probes=PROBES)
+    record = trial.run(SEEDS[0], SensedHand(scene))
+    assert not record.lost
+    assert record.column("eps_f")[-1] < 1e-3 < record.column("eps_f")[0]
+
+
+# ---------------------------------------------------------------- limits
+
+
+def narrowed(robot, joint, lower, upper):
+    """The robot with another range for one joint."""
+    model = copy.copy(robot.model)
+    model.jnt_range[model.joint(joint).id] = lower, upper
+    return dataclasses.replace(robot, model=model)
+
+
+def narrowed_scene(folder, scene, joint, old, new):
+    """The scene with a robot folder of its own, in which one joint has another range."""
+    source = scene.articulated.description.xml
+    text = source.read_text()
+    line = next(row for row in text.splitlines() if f'<joint name="{joint}"' in row)
+    assert line.count(f'range="{old}"') == 1
+    changed = line.replace(f'range="{old}"', f'range="{new[0]!r} {new[1]!r}"')
+    (folder / source.name).write_text(text.replace(line, changed))
+    (folder / "robot.toml").write_text((source.parent / "robot.toml").read_text())
+    return Scene(folder, scene.object, scene.position)
+
+
+@pytest.fixture(scope="module")
+def tight(records, scene):
+    """Grasps, each with a robot whose arm may hardly move from there."""
+    robot = scene.articulated
+    cases = []
+    for record in records.values():
+        for grasp in record.grasps[:2]:
+            limited = robot
+            for joint in robot.description.arm[:5]:
+                q = grasp.q[robot.index(joint)]
+                limited = narrowed(limited, joint, q - 2e-3, q + 2e-3)
+            limits = StepLimit(), ConfigurationLimit(limited)
+            cases.append((grasp, limited, limits))
+    return cases
+
+
+def force_left(x, grasp):
+    task = ForceTask()
+    return np.linalg.norm(task.jacobian(grasp) @ x + task.error(grasp))
+
+
+def test_at_a_limit_the_hierarchy_keeps_forces_priority_and_the_clipped_step_does_not(tight):
+    worse = 0
+    for grasp, limited, limits in tight:
+        stack = dataclasses.replace(stack_of("fmk"), hold_contacts=False)
+        stack = stack.within(*limits)
+        solution = HQP(rank_tolerance=TOUCH_RANK).solve(stack.levels(grasp))
+        assert solution.limit_active and solution.is_optimal(stack.levels(grasp))
+        projected = Projection(rank_tolerance=TOUCH_RANK).solve(stack.law_levels(grasp))
+        clipped = clip_to_limits(projected.x, stack, grasp)
+        for x in (solution.x, clipped):
+            assert limited.violation(grasp.q + x) <= CLIP_TOLERANCE
+        ours, theirs = force_left(solution.x, grasp), force_left(clipped, grasp)
+        assert ours <= theirs + 1e-9
+        worse += theirs > 1.1 * ours + 1e-6
+    assert worse >= len(tight) // 2
+
+
+def test_at_a_limit_lower_laws_change_nothing_for_force(tight):
+    for grasp, _, limits in tight:
+        alone, above = (
+            HQP(rank_tolerance=TOUCH_RANK).solve(stack_of(letters).within(*limits).levels(grasp)).x
+            for letters in ("f", "fmk")
+        )
+        assert force_left(above, grasp) == pytest.approx(force_left(alone, grasp), abs=1e-9)
+
+
+def test_with_a_joint_at_its_limit_throughout_only_the_hierarchy_converges(
+    tmp_path, scene, stack, records
+):
+    """The arm's first joint begins at its lower limit, and the laws go on pulling it further."""
+    first = records[SEEDS[2]].grasps[0]
+    j = scene.articulated.index("wam_j1")
+    lower = float(first.q[j])
+    limited = narrowed_scene(tmp_path, scene, "wam_j1", "-2.6 2.6", (lower, 2.6))
+    found = {}
+    for form in ("hierarchy", "clipped"):
+        hand = Hand(GeometricProbe(limited), first=first)
+        found[form] = Trial(limited, stack, probes=PROBES, form=form).run(SEEDS[2], hand)
+        assert set(found[form].column("limit_violation")) == {0.0}
+    assert all(row["limit_active"] for row in found["hierarchy"].rows[1:])
+    at = [grasp.q[j] for grasp in found["hierarchy"].grasps]
+    np.testing.assert_allclose(at, lower, atol=CLIP_TOLERANCE)
+    assert found["hierarchy"].converged_at is not None
+    assert found["clipped"].converged_at is None
+
+
+def test_a_start_outside_a_range_walks_back_within_the_caps(tmp_path, scene, stack, records):
+    """The keyframe of the narrowed robot is outside the range too."""
+    first = records[SEEDS[0]].grasps[0]
+    j = scene.articulated.index("wam_j5")
+    upper = float(first.q[j]) - 0.5
+    limited = narrowed_scene(tmp_path, scene, "wam_j5", "-4.76 1.24", (-4.76, upper))
+    hand = Hand(GeometricProbe(limited), first=first)
+    record = Trial(limited, stack, probes=5).run(SEEDS[0], hand)
+    cap = StepLimit().joint
+    away = [0.5, 0.5 - cap, 0.0, 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(record.column("limit_violation"), away, atol=CLIP_TOLERANCE)
+    assert set(record.column("limit_violation")[2:]) == {0.0}
+    assert not record.lost
+
+
+def test_home_outside_a_range_is_no_obstacle_to_a_start(tmp_path, scene, stack):
+    home = scene.articulated.home[scene.articulated.index("wam_j6")]
+    limited = narrowed_scene(tmp_path, scene, "wam_j6", "-1.6 1.6", (-1.6, float(home) - 0.5))
+    record = Trial(limited, stack, probes=1).run(SEEDS[1])
+    assert set(record.column("limit_violation")) == {0.0}
+
+
+def test_a_joint_inside_its_range_stays_there_while_another_walks_back(scene, stack, records):
+    robot = scene.articulated
+    first = records[SEEDS[0]].grasps[0]
+    outside, inside = robot.index("wam_j5"), robot.index("wam_j6")
+    q = first.q.copy()
+    q[outside] = robot.q_upper[outside] + 0.5
+    q[inside] = robot.q_upper[inside]
+    start = dataclasses.replace(first, q=q)
+    hand = Replay(start, first)
+    Trial(scene, stack, probes=1, landing=False).run(SEEDS[0], hand)
+    target = hand.targets[-1]
+    assert target[inside] <= robot.q_upper[inside]
+    assert robot.q_upper[outside] < target[outside] < q[outside]
+
+
+def test_a_stack_with_caps_of_its_own_still_keeps_the_robots_ranges(scene, stack):
+    record = Trial(scene, stack.within(StepLimit()), probes=PROBES).run(SEEDS[2])
+    assert set(record.column("limit_violation")) == {0.0}
+    assert record.converged_at is not None

@@ -1,0 +1,643 @@
+"""The hierarchy's answers: exact, certified, strict, whatever the solver and the problem."""
+
+import numpy as np
+import pytest
+from oracle import lexicographic_optimum
+from problems import Rows, box, equal, general, near_singular, scaling, three_level
+from test_oracle import HAND
+
+import hqp_grasp
+from hqp_grasp import HQP, InputError, Level, Solution
+from hqp_grasp.hierarchy import certificate
+from hqp_grasp.hierarchy import hqp as hqp_module
+from hqp_grasp.hierarchy.hqp import solvers
+
+INF = np.inf
+# What strictness is promised to: lower levels worsen none above by more than this, relative. As
+# the active set is settled exactly, everything else here holds to the same; a miss is measured in
+# units of its rows, |nearest admissible value| + ‖a‖‖x‖.
+TOL = 1e-9
+
+ANY = "proxqp"  # where the solver makes no difference
+ANGLES = [10.0**-k for k in range(1, 15)]
+
+
+@pytest.fixture(params=solvers())
+def solver(request):
+    return request.param
+
+
+@pytest.fixture(params=[True, False], ids=["shortcuts", "no shortcuts"])
+def shortcuts(request):
+    return request.param
+
+
+def built(problem):
+    return [Level(*rows) for rows in problem]
+
+
+def solve(problem, solver=ANY, **options):
+    """The certified answer to a hierarchy."""
+    levels = built(problem)
+    answer = HQP(solver=solver, **options).solve(levels)
+    assert np.isfinite(answer.x).all()
+    assert answer.is_optimal(levels)
+    for level, report in zip(levels, answer.levels, strict=True):
+        room = TOL * units(level, answer.x)
+        np.testing.assert_allclose(report.residual, level.residual(answer.x), rtol=0, atol=room)
+    return answer
+
+
+def units(rows, x, floor=0.0):
+    nearest = np.clip(rows.A @ x, rows.lower, rows.upper)
+    length = np.linalg.norm(x) + floor
+    return np.linalg.norm(np.abs(nearest) + np.linalg.norm(rows.A, axis=1) * length)
+
+
+def rounding(problem):
+    """A length of x that is none: 1e-15 of the way to the farthest bound that x = 0 breaks."""
+    far = 0.0
+    for A, lower, upper in problem:
+        norm = np.linalg.norm(A, axis=1)
+        bound = np.abs(np.clip(0.0, lower, upper))[norm > 0]
+        far = max(far, np.max(bound / norm[norm > 0], initial=0.0))
+    return 1e-15 * far
+
+
+def assert_same_misses(problem, x, misses):
+    """Every level is missed by as much as the optimum misses it, neither more nor less."""
+    floor = rounding(problem) / TOL
+    for k, (rows, known) in enumerate(zip(problem, misses, strict=False)):
+        ours = np.linalg.norm(Level(*rows).residual(x))
+        room = TOL * units(rows, x, floor)
+        assert abs(ours - np.linalg.norm(known)) <= room, f"level {k}"
+
+
+def assert_same_point(x, known):
+    np.testing.assert_allclose(x, known, rtol=0, atol=TOL * (1.0 + np.linalg.norm(known)))
+
+
+def fuzz(seed, **options):
+    return general(np.random.default_rng(np.random.SeedSequence([7, seed])), **options)
+
+
+# ---------------------------------------------------------------- exact
+
+
+@pytest.mark.parametrize("name", HAND)
+def test_answers_known_by_hand(name, shortcuts):
+    problem, x, misses = HAND[name]
+    for solver in solvers():
+        answer = solve(problem, solver, shortcuts=shortcuts)
+        assert_same_point(answer.x, x)
+        assert_same_misses(problem, answer.x, misses)
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "mid", "hard"])
+def test_every_solver_gives_the_reference_optimum(difficulty, solver, shortcuts):
+    for seed in range(3):
+        problem = three_level(np.random.default_rng(seed), difficulty)
+        x, misses = lexicographic_optimum(problem)
+        answer = solve(problem, solver, shortcuts=shortcuts)
+        assert_same_point(answer.x, x)
+        assert_same_misses(problem, answer.x, misses)
+
+
+@pytest.mark.parametrize(("n", "levels"), [(6, 2), (6, 8), (12, 5), (20, 3), (30, 6)])
+def test_sizes_of_real_robots_are_answered_exactly(n, levels, shortcuts):
+    problem = scaling(np.random.default_rng(n), n, levels)
+    x, misses = lexicographic_optimum(problem)
+    answer = solve(problem, shortcuts=shortcuts)
+    assert_same_point(answer.x, x)
+    assert_same_misses(problem, answer.x, misses)
+
+
+@pytest.mark.parametrize("seed", range(150))
+def test_anything_that_can_be_built_is_missed_by_as_little_as_possible(seed):
+    problem = fuzz(seed, max_n=12, max_levels=5, max_rows=6)
+    answer = solve(problem, ("proxqp", "daqp")[seed % 2])
+    known, misses = lexicographic_optimum(problem)
+    assert_same_misses(problem, answer.x, misses)
+    # and of the optima, none is shorter
+    assert np.linalg.norm(answer.x) <= (1.0 + TOL) * np.linalg.norm(known) + rounding(problem)
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_anything_large_is_certified(seed):
+    solve(fuzz(1000 + seed), ("proxqp", "daqp")[seed % 2])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_anything_small_is_answered_by_every_solver_alike(seed, shortcuts):
+    problem = fuzz(2000 + seed, max_n=8, max_levels=4, max_rows=5, scales=False)
+    x, misses = lexicographic_optimum(problem)
+    for solver in solvers():
+        answer = solve(problem, solver, shortcuts=shortcuts)
+        assert_same_point(answer.x, x)
+        assert_same_misses(problem, answer.x, misses)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-9, 1e-15])
+def test_a_level_in_small_units_below_one_in_large_units_is_solved_in_its_own(unit):
+    problem = [equal([[1, 1, 0], [1, 1, 0]], [1, 2]), equal([[unit, 0, unit]], [unit])]
+    assert_same_point(solve(problem).x, lexicographic_optimum(problem)[0])
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e-6])
+def test_a_limit_in_small_units_beside_one_in_large_units_is_kept(unit, shortcuts):
+    limits = Rows(np.diag([1.0, unit]), np.full(2, -INF), np.array([1.0, unit]))
+    for solver in solvers():
+        answer = solve([limits, equal(np.eye(2), [5.0, 5.0])], solver, shortcuts=shortcuts)
+        assert_same_point(answer.x, [1, 1])
+
+
+# ---------------------------------------------------------------- strict
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_lower_levels_never_worsen_those_above(seed):
+    if seed % 2:
+        problem = three_level(np.random.default_rng(seed), ("easy", "mid", "hard")[seed % 3])
+    else:
+        problem = fuzz(3000 + seed)
+    whole = solve(problem)
+    for k in range(1, len(problem)):
+        prefix = solve(problem[:k])
+        assert_same_misses(problem[:k], whole.x, [level.residual for level in prefix.levels])
+
+
+def test_a_level_that_pulls_a_million_times_harder_moves_nothing_above():
+    rng = np.random.default_rng(0)
+    problem = three_level(rng, "mid")
+    reference = solve(problem[:2])
+    problem[2] = Rows(*(1e6 * part for part in equal(problem[2].A, 1e3 * problem[2].lower)))
+    whole = solve(problem)
+    assert_same_misses(problem[:2], whole.x, [level.residual for level in reference.levels])
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_limits_that_contain_zero_are_never_broken(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 12))
+    width = rng.exponential(size=n)
+    limits = [Rows(np.eye(n), -width * rng.integers(0, 2, n), width)]
+    A = rng.standard_normal((5, n))
+    limits.append(Rows(A, np.full(5, -INF), rng.exponential(size=5)))
+    answer = solve([*limits, *fuzz_of_width(rng, n)])
+    for rows, report in zip(limits, answer.levels, strict=False):
+        assert report.status == "met"
+        assert np.abs(report.residual).max() <= TOL * units(rows, answer.x)
+
+
+def fuzz_of_width(rng, n):
+    for _ in range(4):
+        m = int(rng.integers(1, 7))
+        A = rng.standard_normal((m, n)) * 10.0 ** rng.uniform(-3, 3)
+        lower, upper = np.sort(10.0 * rng.standard_normal((2, m)), axis=0)
+        yield Rows(A, lower, upper) if rng.random() < 0.3 else equal(A, upper)
+
+
+# ---------------------------------------------------------------- the shortest of many
+
+
+@pytest.mark.parametrize("m", [1, 3, 6])
+def test_of_many_optima_the_shortest_is_returned(m, solver, shortcuts):
+    rng = np.random.default_rng(m)
+    A, b = rng.standard_normal((m, 7)), rng.standard_normal(m)
+    answer = solve([equal(A, b)], solver, shortcuts=shortcuts)
+    assert_same_point(answer.x, np.linalg.pinv(A) @ b)
+
+
+def test_the_shortest_is_sought_within_the_limits(solver, shortcuts):
+    wide = Rows(np.eye(2), np.array([-INF, -INF]), np.array([0.5, INF]))
+    problem = [wide, equal([[1, 1]], [2])]  # without the limit: [1, 1]
+    answer = solve(problem, solver, shortcuts=shortcuts)
+    assert_same_point(answer.x, [0.5, 1.5])
+
+
+@pytest.mark.parametrize("index", [135, 386, 533, 1495, 2081, 2273])
+def test_rows_that_were_in_the_way_once_are_let_go_for_a_shorter_answer(index, shortcuts):
+    """Problems in which rows that held x during the search leave no freedom if they are kept."""
+    problem = general(np.random.default_rng(np.random.SeedSequence([5, index])))
+    known, misses = lexicographic_optimum(problem)
+    for solver in ("proxqp", "daqp"):
+        answer = solve(problem, solver, shortcuts=shortcuts)
+        assert_same_misses(problem, answer.x, misses)
+        assert_same_point(answer.x, known)
+
+
+def test_nothing_asked_is_nothing_done(solver, shortcuts):
+    problem = [box(3, 1.0), Rows(np.zeros((0, 3)), np.zeros(0), np.zeros(0))]
+    answer = solve(problem, solver, shortcuts=shortcuts)
+    np.testing.assert_array_equal(answer.x, np.zeros(3))
+    assert not answer.limit_active
+
+
+# ---------------------------------------------------------------- what cannot be met
+
+
+def test_rows_that_contradict_one_another_share_the_miss(solver, shortcuts):
+    problem = [Rows(np.ones((2, 1)), np.array([1.0, -INF]), np.array([INF, -1.0]))]
+    answer = solve(problem, solver, shortcuts=shortcuts)
+    assert_same_point(answer.x, [0])
+    np.testing.assert_allclose(answer.levels[0].residual, [-1, 1], rtol=0, atol=TOL)
+    assert answer.levels[0].status == "nearest"
+
+
+def test_limits_at_two_levels_that_exclude_each_other_are_resolved(solver, shortcuts):
+    """Limits that exclude each other: the first is kept, the second comes as near as it can."""
+    outside = Rows(np.eye(2), np.array([2.0, -INF]), np.array([3.0, INF]))
+    answer = solve([box(2, 1.0), outside, equal(np.eye(2), [0, 0.3])], solver, shortcuts=shortcuts)
+    assert_same_point(answer.x, [1, 0.3])
+    assert [level.status for level in answer.levels] == ["met", "nearest", "nearest"]
+    assert answer.limit_active
+
+
+@pytest.mark.parametrize(
+    ("target", "statuses"),
+    [(0.5, ["met", "met"]), (1.0, ["met", "met"]), (1.0 + 1e-6, ["met", "nearest"])],
+)
+def test_status_tells_met_from_nearest(target, statuses):
+    answer = solve([box(2, 1.0), equal(np.eye(2), [target, 0])])
+    assert [level.status for level in answer.levels] == statuses
+
+
+def test_reports_carry_names_ranks_and_active_rows():
+    rng = np.random.default_rng(0)
+    levels = [
+        Level(np.eye(11), np.full(11, -1e3), np.full(11, 1e3), name="range"),
+        *(Level.equal(rng.standard_normal((m, 11)), np.ones(m), name=f"of {m}") for m in (3, 3)),
+        Level.equal(np.eye(11), np.zeros(11), name="rest"),
+    ]
+    answer = HQP().solve(levels)
+    assert [level.name for level in answer.levels] == ["range", "of 3", "of 3", "rest"]
+    assert [level.rank for level in answer.levels] == [0, 3, 3, 5]
+    np.testing.assert_array_equal(answer.active, [0] * 11 + [2] * 17)
+    assert not answer.limit_active and not answer.failed
+
+
+def test_active_rows_tell_which_bound_holds_x():
+    answer = solve([box(3, 1.0), equal(np.eye(3), [5, -5, 0.5])])
+    np.testing.assert_array_equal(answer.active, [1, -1, 0, 2, 2, 2])
+    assert answer.limit_active
+    assert [level.rank for level in answer.levels] == [2, 1]
+
+
+# ---------------------------------------------------------------- warm start and shortcuts
+
+
+@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+def test_a_warm_start_changes_the_way_and_not_the_answer(solver):
+    hqp = HQP(solver=solver)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        problem = three_level(rng, "hard")
+        moved = [
+            problem[0],
+            *(equal(A, b + 0.01 * rng.standard_normal(len(b))) for A, b, _ in problem[1:]),
+        ]
+        cold, before = hqp.solve(built(problem)), hqp.solve(built(moved))
+        for warm in (cold, before):
+            again = hqp.solve(built(problem), warm=warm)
+            assert again.is_optimal(built(problem))
+            assert_same_point(again.x, cold.x)
+
+
+def test_a_warm_start_from_its_own_answer_needs_no_solver():
+    for seed in range(10):
+        levels = built(three_level(np.random.default_rng(seed), "hard"))
+        first = HQP().solve(levels)
+        assert HQP().solve(levels, warm=first).method == "shortcut"
+
+
+def test_a_warm_start_from_its_own_answer_needs_one_active_set(monkeypatch):
+    levels = built(three_level(np.random.default_rng(0), "hard"))
+    answer = HQP().solve(levels)
+    assert (np.abs(answer.active) == 1).any()
+    monkeypatch.setattr(hqp_module, "QUICK_ROUNDS", 1)
+    monkeypatch.setattr(hqp_module, "PIVOTS", 0)
+    assert HQP().solve(levels, warm=answer).method == "shortcut"
+    assert HQP().solve(levels).method != "shortcut"
+
+
+def test_a_warm_start_from_another_problem_does_no_harm():
+    rng = np.random.default_rng(0)
+    problem = three_level(rng, "mid")
+    cold = solve(problem)
+    misleading = solve([problem[0], *(equal(A, -20 * b) for A, b, _ in problem[1:])])
+    sided = Solution(cold.x, (), np.full(28, 1, np.int8), np.zeros((28, 4)), "made up")
+    shorter = solve(problem[:2])
+    for warm in (misleading, sided, shorter):
+        again = HQP().solve(built(problem), warm=warm)
+        assert_same_point(again.x, cold.x)
+
+
+def test_a_warm_start_never_holds_a_row_at_an_infinite_bound():
+    one_sided = Rows(np.eye(3), np.full(3, -INF), np.ones(3))
+    levels = built([one_sided, equal(np.eye(3), [2, 0, 0])])
+    warm = Solution(np.zeros(3), (), np.full(6, -1, np.int8), np.zeros((6, 2)), "made up")
+    assert_same_point(HQP().solve(levels, warm=warm).x, [1, 0, 0])
+
+
+def counting(monkeypatch, name):
+    calls = []
+    backend = hqp_module.OWN_INTERFACE[name]
+
+    def counted(*arguments):
+        calls.append(name)
+        return backend(*arguments)
+
+    monkeypatch.setitem(hqp_module.OWN_INTERFACE, name, counted)
+    return calls
+
+
+@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+def test_without_shortcuts_every_answer_comes_through_the_solver(monkeypatch, solver):
+    calls = counting(monkeypatch, solver)
+    problem = three_level(np.random.default_rng(0), "easy")
+    assert solve(problem, solver, shortcuts=False).method == solver
+    assert calls
+    calls.clear()
+    assert solve(problem, solver).method == "shortcut"
+    assert not calls
+
+
+# ---------------------------------------------------------------- solvers that fail
+
+
+def raising(error):
+    def backend(P, q, G, lower, upper):
+        raise error
+
+    return backend
+
+
+def answering(value):
+    def backend(P, q, G, lower, upper):
+        return np.full(len(q), value), np.full(len(G), value)
+
+    return backend
+
+
+@pytest.mark.parametrize(
+    "backend",
+    [
+        raising(hqp_module._BackendError("gave up")),
+        raising(RuntimeError("crashed")),
+        raising(ValueError("did not like the matrix")),
+        raising(np.linalg.LinAlgError("singular")),
+        raising(ZeroDivisionError("division by zero")),
+        answering(np.nan),
+        answering(INF),
+    ],
+    ids=["gives up", "RuntimeError", "ValueError", "LinAlgError", "ZeroDivision", "nan", "inf"],
+)
+@pytest.mark.parametrize("solver", ["proxqp", "daqp"])
+def test_a_solver_that_fails_is_named_and_the_answer_is_right(monkeypatch, solver, backend):
+    monkeypatch.setitem(hqp_module.OWN_INTERFACE, solver, backend)
+    for seed in range(3):
+        problem = three_level(np.random.default_rng(seed), "hard")
+        x, _ = lexicographic_optimum(problem)
+        answer = solve(problem, solver, shortcuts=False)
+        assert_same_point(answer.x, x)
+        assert answer.method != solver
+        assert any(reason.startswith(solver) for reason in answer.failed)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -1.0, 1e9, -1e30, 1e300])
+def test_a_solver_that_answers_nonsense_does_no_harm(monkeypatch, value):
+    monkeypatch.setitem(hqp_module.OWN_INTERFACE, "proxqp", answering(value))
+    for difficulty in ("easy", "mid", "hard"):
+        problem = three_level(np.random.default_rng(5), difficulty)
+        x, _ = lexicographic_optimum(problem)
+        answer = solve(problem, shortcuts=False)
+        assert_same_point(answer.x, x)
+        assert answer.method == "proxqp" or "proxqp" in answer.failed[0]
+
+
+def test_a_solver_that_answers_at_random_does_no_harm(monkeypatch):
+    rng = np.random.default_rng(0)
+
+    def dice(P, q, G, lower, upper):
+        return rng.standard_normal(len(q)), rng.standard_normal(len(G))
+
+    monkeypatch.setitem(hqp_module.OWN_INTERFACE, "daqp", dice)
+    for seed in range(10):
+        problem = fuzz(4000 + seed, max_n=8, max_levels=4, max_rows=5, scales=False)
+        answer = solve(problem, "daqp", shortcuts=False)
+        assert_same_misses(problem, answer.x, lexicographic_optimum(problem)[1])
+
+
+# ---------------------------------------------------------------- invariance
+
+
+def turned(problem, Q):
+    return [Rows(A @ Q, lower, upper) for A, lower, upper in problem]
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "mid", "hard"])
+def test_what_must_not_matter_does_not(difficulty):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        problem = three_level(rng, difficulty)
+        x = solve(problem).x
+        # the unit of a level, beyond all sense
+        weights = 10.0 ** rng.uniform(-6, 6, size=len(problem))
+        scaled = [
+            Rows(*(s * part for part in rows)) for s, rows in zip(weights, problem, strict=True)
+        ]
+        assert_same_point(solve(scaled).x, x)
+        # the order of rows within a level
+        shuffled = [
+            Rows(*(part[order] for part in rows))
+            for rows, order in ((rows, rng.permutation(len(rows.A))) for rows in problem)
+        ]
+        assert_same_point(solve(shuffled).x, x)
+        # the sign of rows
+        negated = [Rows(-A, -upper, -lower) for A, lower, upper in problem]
+        assert_same_point(solve(negated).x, x)
+        # asking again, lower down, for what a level above has decided
+        assert_same_point(solve([*problem, problem[1], problem[0]]).x, x)
+        # limits too far away to be felt, and rows without bounds
+        far = Rows(problem[1].A, np.full(3, -1e3), np.full(3, INF))
+        assert_same_point(solve([problem[0], far, *problem[1:]]).x, x)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e3, 1e6])
+def test_targets_scale_the_answer(factor):
+    for difficulty in ("easy", "mid", "hard"):
+        problem = three_level(np.random.default_rng(1), difficulty)
+        far = [Rows(A, factor * lower, factor * upper) for A, lower, upper in problem]
+        assert_same_point(solve(far).x / factor, solve(problem).x)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_turning_the_axes_turns_the_answer(seed):
+    rng = np.random.default_rng(seed)
+    problem = three_level(rng, ("mid", "hard")[seed % 2])
+    Q = np.linalg.qr(rng.standard_normal((11, 11)))[0]
+    assert_same_point(Q @ solve(turned(problem, Q)).x, solve(problem).x)
+
+
+def test_answers_repeat_to_the_bit():
+    for seed in range(10):
+        problem = fuzz(5000 + seed)
+        np.testing.assert_array_equal(solve(problem).x, solve(problem).x)
+
+
+def test_levels_are_not_changed_by_solving_them():
+    problem = three_level(np.random.default_rng(0), "hard")
+    before = [[part.copy() for part in rows] for rows in problem]
+    solve(problem)
+    for rows, copy in zip(problem, before, strict=True):
+        for part, same in zip(rows, copy, strict=True):
+            np.testing.assert_array_equal(part, same)
+
+
+# ---------------------------------------------------------------- near a loss of rank
+
+
+@pytest.mark.parametrize("agree", [False, True])
+@pytest.mark.parametrize("angle", ANGLES, ids="{:.0e}".format)
+def test_nearly_parallel_levels_are_answered_within_their_limits(angle, agree):
+    for seed in range(3):
+        problem = near_singular(np.random.default_rng(seed), angle, agree=agree)
+        _, misses = lexicographic_optimum(problem)
+        for solver in ("proxqp", "daqp"):
+            answer = solve(problem, solver)
+            assert np.abs(answer.x).max() <= 0.25 * (1.0 + TOL)
+            # Where x jumps, its posture does: compare what is asked before it.
+            assert_same_misses(problem[:3], answer.x, misses[:3])
+
+
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-8, 1e-4, 1e-2])
+@pytest.mark.parametrize("angle", ANGLES[::2], ids="{:.0e}".format)
+def test_any_rank_tolerance_gives_a_certified_answer_within_the_limits(angle, tolerance):
+    for seed in range(3):
+        problem = near_singular(np.random.default_rng(seed), angle)
+        answer = solve(problem, rank_tolerance=tolerance)
+        assert np.abs(answer.x).max() <= 0.25 * (1.0 + TOL)
+
+
+@pytest.mark.parametrize("damping", [1e-8, 1e-4, 1.0])
+@pytest.mark.parametrize("angle", ANGLES[::2], ids="{:.0e}".format)
+def test_damped_levels_are_certified_and_stay_within_the_limits(angle, damping):
+    for seed in range(3):
+        levels = HQP().damped(built(near_singular(np.random.default_rng(seed), angle)), damping)
+        answer = HQP().solve(levels)
+        assert answer.is_optimal(levels)
+        assert np.abs(answer.x).max() <= 0.25 * (1.0 + TOL)
+
+
+def test_damping_weighs_the_miss_of_a_level_against_the_length_of_x():
+    """min (x₁ + x₂ − 2)² + λ ‖x‖² with x₂ ≤ 0.1, by hand: x₁ = (2 − 0.1) / (1 + λ)."""
+    damping = 0.5
+    limit = Level([[0.0, 1.0]], [-INF], [0.1])
+    levels = HQP().damped([limit, Level.equal([[1.0, 1.0]], [2.0], "sum")], damping)
+    assert levels[0] is limit and levels[1].name == "sum, damped"
+    assert_same_point(HQP().solve(levels).x, [1.9 / (1.0 + damping), 0.1])
+
+
+def test_a_damped_level_admits_what_its_own_inequalities_were_left_with():
+    """min (x − 1)² + (x + 1)²₊ + λ x², the second for x ≤ −1, by hand: x = 0."""
+    levels = HQP().damped([Level([[1.0], [1.0]], [1.0, -INF], [1.0, -1.0])], 0.1)
+    assert_same_point(HQP().solve(levels).x, [0.0])
+    assert levels[0].upper[1] == pytest.approx(0.0, abs=TOL) and levels[0].lower[1] == -INF
+
+
+def test_each_level_may_have_a_damping_of_its_own():
+    levels = [Level.equal([[1.0, 0.0]], [1.0]), Level.equal([[0.0, 1.0]], [1.0])]
+    held = HQP().damped(levels, [0.0, 1.0], reference=[0.0, 3.0])
+    assert held[0] is levels[0]
+    assert_same_point(HQP().solve(held).x, [1.0, 2.0])
+
+
+def test_the_rank_tolerance_decides_what_counts_as_independent():
+    problem = near_singular(np.random.default_rng(0), 1e-6, limits=False)
+    strict, truncated = solve(problem), solve(problem, rank_tolerance=1e-3)
+    assert [level.rank for level in strict.levels] == [3, 3, 5]
+    assert [level.rank for level in truncated.levels] == [3, 0, 8]
+    assert np.linalg.norm(strict.x) > 1e3 > np.linalg.norm(truncated.x)
+    assert strict.levels[1].status == "met" and truncated.levels[1].status == "nearest"
+
+
+def test_rows_that_differ_in_the_last_digit_and_contradict_each_other_share_the_miss():
+    """The second row knows x₂ … x₇ by 1e-16 only: below the rank of its level."""
+    noise = 1e-16 * np.random.default_rng(0).standard_normal(7)
+    answer = solve([equal([np.eye(7)[0], np.eye(7)[0] + noise], [1.0, -1.0])])
+    assert_same_point(answer.x, np.zeros(7))
+    assert answer.levels[0].rank == 1
+
+
+def test_an_answer_that_is_not_shown_to_be_the_shortest_is_not_withheld(monkeypatch):
+    def never_the_shortest(*arguments):
+        residual, missed, faults = certificate.optimality_faults(*arguments)
+        return residual, missed, {**faults, len(missed): "least norm of x: not shown"}
+
+    monkeypatch.setattr(hqp_module, "optimality_faults", never_the_shortest)
+    levels = built([box(3, 1.0), equal([[1.0, 1.0, 1.0]], [1.5])])
+    answer = HQP().solve(levels)
+    assert answer.is_optimal(levels)
+    assert_same_point(answer.x, [0.5, 0.5, 0.5])
+    assert all("least norm" in fault for fault in answer.failed) and answer.failed
+
+
+def test_levels_exactly_parallel_are_one_level_and_a_miss():
+    rng = np.random.default_rng(0)
+    A, b = rng.standard_normal((3, 7)), rng.standard_normal(3)
+    mix = rng.standard_normal((3, 3))
+    answer = solve([equal(A, b), equal(mix @ A, np.zeros(3))])
+    assert_same_point(answer.x, np.linalg.pinv(A) @ b)
+    assert [level.rank for level in answer.levels] == [3, 0]
+    assert [level.status for level in answer.levels] == ["met", "nearest"]
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def test_an_unknown_solver_is_refused_with_the_list_of_those_known():
+    with pytest.raises(InputError, match="unknown solver 'simplex'") as refusal:
+        HQP(solver="simplex")
+    for name in solvers():
+        assert name in str(refusal.value)
+
+
+def test_proxqp_is_the_default_and_the_list_names_no_solver_twice():
+    assert HQP().solver == "proxqp"
+    assert {"proxqp", "daqp"} <= set(solvers())
+    assert len(set(solvers())) == len(solvers())
+    assert hqp_grasp.solvers() == solvers()
+
+
+@pytest.mark.parametrize("tolerance", [-1e-9, 1.0, 2.0, np.nan, INF])
+def test_a_rank_tolerance_out_of_range_is_refused(tolerance):
+    with pytest.raises(InputError, match="rank_tolerance must lie in"):
+        HQP(rank_tolerance=tolerance)
+
+
+@pytest.mark.parametrize("damping", [-1e-9, np.nan, INF, [0.1, -1.0], [0.1], [[0.1, 0.1]]])
+def test_damping_that_is_no_damping_is_refused(damping):
+    levels = built([box(2, 1.0), equal(np.eye(2), np.ones(2))])
+    with pytest.raises(InputError, match=r"damping must be ≥ 0, one number or one for each level"):
+        HQP().damped(levels, damping)
+
+
+@pytest.mark.parametrize("reference", [[0.0], [0.0, np.nan], 1.0, "here"])
+def test_a_reference_that_is_no_point_is_refused(reference):
+    with pytest.raises(InputError, match="reference must be 2 finite numbers"):
+        HQP().damped(built([box(2, 1.0)]), 0.1, reference)
+
+
+def test_levels_of_different_width_are_refused_with_their_widths():
+    with pytest.raises(InputError, match=r"number of unknowns: \[2, 3\]"):
+        HQP().solve(built([box(2, 1.0), box(3, 1.0)]))
+
+
+def test_a_hierarchy_without_levels_is_refused():
+    with pytest.raises(InputError, match="at least one level"):
+        HQP().solve([])
+
+
+def test_an_hqp_cannot_be_changed():
+    with pytest.raises(AttributeError):
+        HQP().solver = "daqp"

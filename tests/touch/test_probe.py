@@ -1,0 +1,406 @@
+"""Touching: where the tips end up, that nothing was touched before, and every way to miss."""
+
+import pickle
+
+import mujoco
+import numpy as np
+import pytest
+import tiny_hand
+from surfaces import nearest_on_circle, nearest_on_polygon
+from tiny_hand import LENGTH, STIFF, TIP, change
+
+from hqp_grasp.errors import InputError
+from hqp_grasp.grasp import Grasp, Miss, Missed
+from hqp_grasp.touch.geometric import RETREAT, GeometricProbe
+from hqp_grasp.world.scene import Cylinder, Prism, Scene
+
+SURFACE_TOL = 1e-7  # [m]
+NORMAL_TOL = 1e-6
+AGAIN_TOL = 1e-7  # [rad]
+EXACT = 1e-12
+TALL = 0.4  # [m] so that only the sides are met
+OBJECTS = {"cylinder": Cylinder(0.05, TALL), "hexagon": Prism.regular(6, 0.05, TALL)}
+POSTURES = (  # [rad] from which every finger touches either object
+    (0.62, 1.12, -0.73, 1.96, 0.63, -0.41, 0.49, 0.21, 1.01, 0.99, 0.98),
+    (-0.78, 1.21, 1.02, 1.86, -0.71, 0.02, -0.62, 0.54, 0.9, 1.25, 1.03),
+    (0.32, 0.94, -0.35, 2.21, 0.17, -0.86, 0.33, 0.29, 0.96, 1.17, 1.02),
+    (-0.75, 1.33, 1.16, 1.48, -0.28, 0.71, -1.38, 0.25, 0.96, 1.22, 1.03),
+)
+# and one where links of finger 1 are in the cylinder
+CROWDED = (-0.72, 1.14, 0.88, 1.93, -0.63, -0.18, -0.59, 1.06, 0.66, 1.2, 1.02)
+
+
+class World:
+    """A scene, its probe, and grasps felt around the postures."""
+
+    def __init__(self, thing, around=6):
+        self.scene = Scene(object=thing)
+        self.robot = self.scene.articulated
+        self.probe = GeometricProbe(self.scene)
+        self.data = mujoco.MjData(self.scene.model)
+        self.flexion = [j for (j,) in self.robot.flexion]
+        self.grasps, self.targets, self.missed = [], [], []
+        rng = np.random.default_rng(0)
+        for posture in POSTURES:
+            for _ in range(around):
+                q = posture + rng.normal(0.0, 0.05, self.robot.n)
+                q = np.clip(q, self.robot.q_lower, self.robot.q_upper)
+                touched = self.probe.touch(q)
+                if isinstance(touched, Grasp):
+                    self.grasps.append(touched)
+                    self.targets.append(q)
+                else:
+                    self.missed.append((q, touched))
+        assert len(self.grasps) >= 10
+
+    def nearest(self, p):
+        """Signed distance of p (3,) from the object, and the outward normal there (3,)."""
+        above = p[:2] - self.scene.position[:2]
+        thing = self.scene.object
+        if isinstance(thing, Cylinder):
+            distance, normal = nearest_on_circle(thing.radius, above)
+        else:
+            distance, normal = nearest_on_polygon(thing.polygon, above)
+        return distance, np.array([*normal, 0.0])
+
+
+@pytest.fixture(scope="module", params=OBJECTS)
+def world(request):
+    return World(OBJECTS[request.param])
+
+
+def same(a, b):
+    """Bitwise the same outcome."""
+    if isinstance(a, Missed) or isinstance(b, Missed):
+        return a == b
+    fields = ("q", "jacobian", "hessian", "positions", "normals")
+    return a.other_links == b.other_links and all(
+        np.array_equal(getattr(a, f), getattr(b, f)) for f in fields
+    )
+
+
+# ---------------------------------------------------------------- what a grasp says
+
+
+def test_contacts_lie_on_the_surface(world):
+    for grasp in world.grasps:
+        for x in grasp.positions:
+            assert abs(world.nearest(x)[0]) < SURFACE_TOL
+
+
+def test_normals_are_the_surfaces(world):
+    for grasp in world.grasps:
+        for contact, center in zip(grasp.contacts, world.robot.centers(grasp.q), strict=True):
+            # At the tip's centre, off the surface, the normal is defined at a corner too.
+            _, normal = world.nearest(center)
+            np.testing.assert_allclose(contact.normal, normal, atol=NORMAL_TOL)
+            np.testing.assert_allclose(
+                contact.position + contact.tip_radius * contact.normal, center, atol=EXACT
+            )
+
+
+def test_arm_and_spread_are_the_targets_and_every_joint_is_in_its_range(world):
+    kept = [j for j in range(world.robot.n) if j not in world.flexion]
+    for grasp, target in zip(world.grasps, world.targets, strict=True):
+        np.testing.assert_array_equal(grasp.q[kept], target[kept])
+        assert world.robot.violation(grasp.q) == 0.0
+
+
+def test_touching_again_from_the_grasp_gives_the_same_grasp(world):
+    for grasp in world.grasps:
+        again = world.probe.touch(grasp.q)
+        assert isinstance(again, Grasp)
+        np.testing.assert_allclose(again.q, grasp.q, rtol=0, atol=AGAIN_TOL)
+        np.testing.assert_allclose(again.positions, grasp.positions, rtol=0, atol=SURFACE_TOL)
+        assert again.other_links == grasp.other_links
+
+
+def test_no_tip_met_the_object_earlier_on_its_way(world):
+    for grasp, target in zip(world.grasps, world.targets, strict=True):
+        q = grasp.q.copy()
+        opened = np.maximum(world.robot.q_lower, target - RETREAT)[world.flexion]
+        for share in np.linspace(0.0, 1.0, 150, endpoint=False):
+            q[world.flexion] = opened + share * (grasp.q[world.flexion] - opened)
+            gaps = [world.nearest(x)[0] for x in world.robot.centers(q)]
+            gaps = np.array(gaps) - world.robot.tip_radius
+            if share == 0.0 and gaps.min() < 0.0:  # then it opened all the way
+                opened = world.robot.q_lower[world.flexion]
+                continue
+            assert gaps.min() > -SURFACE_TOL
+
+
+def test_jacobian_hessian_and_coupling_are_the_robots_where_it_stands(world):
+    for grasp in world.grasps:
+        world.robot.place(world.data, grasp.q)
+        np.testing.assert_array_equal(grasp.jacobian, world.robot.jacobian(grasp.q))
+        np.testing.assert_array_equal(grasp.hessian, world.robot.hessian(grasp.q))
+        np.testing.assert_array_equal(grasp.coupling, world.robot.coupling)
+        np.testing.assert_array_equal(grasp.offset, world.robot.offset)
+        np.testing.assert_array_equal(grasp.q_full, world.data.qpos)
+
+
+def test_each_contact_names_its_tip_its_link_and_the_point_on_it(world):
+    for grasp in world.grasps[:3]:
+        world.robot.place(world.data, grasp.q)
+        centers = world.robot.centers(grasp.q)
+        for i, contact in enumerate(grasp.contacts):
+            assert contact.name == f"finger_{i + 1}"
+            assert contact.body == f"f{i + 1}_tip"
+            assert contact.tip_radius == 0.008
+            assert contact.flexion == (world.robot.index(f"bhand_f{i + 1}_proximal"),)
+            body = world.data.body(contact.body)
+            point = body.xpos + body.xmat.reshape(3, 3) @ contact.point
+            np.testing.assert_allclose(point, centers[i], atol=EXACT)
+
+
+def test_a_grasp_outlives_the_next_touch(world):
+    grasp = world.probe.touch(world.targets[0])
+    before = pickle.dumps([grasp.q, grasp.jacobian, grasp.hessian, grasp.positions])
+    points = [c.point.copy() for c in grasp.contacts]
+    world.probe.touch(world.targets[-1])
+    assert pickle.dumps([grasp.q, grasp.jacobian, grasp.hessian, grasp.positions]) == before
+    for contact, point in zip(grasp.contacts, points, strict=True):
+        np.testing.assert_array_equal(contact.point, point)
+
+
+def test_the_same_target_gives_bitwise_the_same_grasp_whatever_came_before(world):
+    fresh = GeometricProbe(pickle.loads(pickle.dumps(world.scene)))
+    for grasp, target in reversed(list(zip(world.grasps, world.targets, strict=True))):
+        assert same(world.probe.touch(target), grasp)
+        assert same(fresh.touch(target), grasp)
+    for target, missed in world.missed:
+        assert same(world.probe.touch(target), missed)
+
+
+def test_the_target_is_left_as_it_was(world):
+    target = world.targets[0].copy()
+    world.probe.touch(target)
+    np.testing.assert_array_equal(target, world.targets[0])
+    target.setflags(write=False)
+    assert isinstance(world.probe.touch(target), Grasp)
+
+
+# ---------------------------------------------------------------- one finger, solved by hand
+
+
+def single(folder, radius, distance, bearing, upper=3.0):
+    """The stiff finger and an upright cylinder `distance` from its axis, at angle `bearing`."""
+    tiny_hand.write(folder, change(STIFF, 'range="0 3"', f'range="0 {upper:.17g}"'))
+    where = (distance * np.cos(bearing), distance * np.sin(bearing), 0.0)
+    return GeometricProbe(Scene(folder, Cylinder(radius, TALL), where))
+
+
+def touch_angle(radius, distance, bearing):
+    """Where the tip, on its circle of radius LENGTH, first meets the cylinder."""
+    reach = radius + TIP
+    return bearing - np.arccos((LENGTH**2 + distance**2 - reach**2) / (2 * LENGTH * distance))
+
+
+def distance_of_share(radius, share, side=1):
+    """Distance at which the tip closes at `share` of its speed when it touches.
+
+    The cylinder's axis lies beyond the tip (side 1), or nearer to the finger's axis (side −1).
+    """
+    reach = radius + TIP
+    # The normal is `share` along the tip's motion and the rest along the finger.
+    return np.hypot(LENGTH + side * reach * np.sqrt(1 - share**2), reach * share)
+
+
+def test_the_first_touch_of_a_swinging_finger_is_where_trigonometry_puts_it(tmp_path):
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        radius = rng.choice([0.005, 0.02, 0.05])
+        share = rng.uniform(0.15, 0.95)
+        distance = distance_of_share(radius, share, rng.choice([-1, 1]))
+        bearing = rng.uniform(1.3, 2.5)
+        expected = touch_angle(radius, distance, bearing)
+        grasp = single(tmp_path, radius, distance, bearing).touch(np.array([0.1, expected / 2]))
+        assert isinstance(grasp, Grasp)
+        # The gap is met to TOUCH, the angle to that over the closing speed.
+        assert grasp.q[1] == pytest.approx(expected, abs=1e-8 / (share * LENGTH))
+        assert grasp.q[0] == 0.1
+        (contact,) = grasp.contacts
+        center = LENGTH * np.array([np.cos(expected), np.sin(expected)])
+        axis = distance * np.array([np.cos(bearing), np.sin(bearing)])
+        normal = (center - axis) / (radius + TIP)
+        np.testing.assert_allclose(contact.normal, [*normal, 0.0], atol=NORMAL_TOL)
+        np.testing.assert_allclose(
+            contact.position, [*(center - TIP * normal), 0.1], atol=SURFACE_TOL
+        )
+
+
+def test_a_face_is_met_flat(tmp_path):
+    """A square block whose near face lies along the ray at angle α is met where sin says."""
+    half = 0.04
+    square = Prism(((half, -half), (half, half), (-half, half), (-half, -half)))
+    for near in (0.02, 0.05, 0.08):  # y of the face
+        position = (LENGTH, near + half)
+        tiny_hand.write(tmp_path, STIFF)
+        probe = GeometricProbe(Scene(tmp_path, square, (*position, 0.0)))
+        grasp = probe.touch(np.array([0.0, 0.0]))
+        assert isinstance(grasp, Grasp)
+        expected = np.arcsin((near - TIP) / LENGTH)
+        assert grasp.q[1] == pytest.approx(expected, abs=AGAIN_TOL)
+        np.testing.assert_allclose(grasp.contacts[0].normal, [0, -1, 0], atol=NORMAL_TOL)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.04, 0.02])
+def test_a_grazing_touch_is_a_touch(tmp_path, share):
+    """The tip closes at 2 % of its speed, and yet goes 10 µm deep if it does not stop."""
+    radius, bearing = 0.05, 1.5
+    distance = distance_of_share(radius, share)
+    expected = touch_angle(radius, distance, bearing)
+    grasp = single(tmp_path, radius, distance, bearing).touch(np.array([0.0, 0.0]))
+    assert isinstance(grasp, Grasp)
+    center = LENGTH * np.array([np.cos(grasp.q[1]), np.sin(grasp.q[1])])
+    axis = distance * np.array([np.cos(bearing), np.sin(bearing)])
+    assert abs(np.linalg.norm(center - axis) - radius - TIP) < SURFACE_TOL
+    assert grasp.q[1] < expected + SURFACE_TOL / (share * LENGTH)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("room", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
+def test_a_touch_just_before_the_end_of_the_range_is_a_touch(tmp_path, side, room):
+    bearing, radius = 1.5, 0.05
+    for share in (0.3, 0.6, 0.9):
+        distance = distance_of_share(radius, share, side)
+        expected = touch_angle(radius, distance, bearing)
+        probe = single(tmp_path, radius, distance, bearing, upper=expected + room)
+        grasp = probe.touch(np.array([0.0, 0.0]))
+        assert isinstance(grasp, Grasp)
+        assert grasp.q[1] == pytest.approx(expected, abs=AGAIN_TOL)
+
+
+def test_a_touch_just_beyond_the_end_of_the_range_is_none(tmp_path):
+    bearing, radius = 1.5, 0.05
+    distance = distance_of_share(radius, 0.6)
+    expected = touch_angle(radius, distance, bearing)
+    probe = single(tmp_path, radius, distance, bearing, upper=expected - 1e-6)
+    assert probe.touch(np.array([0.0, 0.0])) == Missed(Miss.NO_TOUCH, "finger")
+
+
+def test_a_finger_that_would_open_into_the_object_opens_all_the_way(tmp_path):
+    radius, bearing = 0.02, 1.5
+    distance = distance_of_share(radius, 0.9)
+    expected = touch_angle(radius, distance, bearing)
+    probe = single(tmp_path, radius, distance, bearing)
+    deep = np.array([0.0, bearing + RETREAT])  # opened by RETREAT, its tip is inside
+    grasp = probe.touch(deep)
+    assert isinstance(grasp, Grasp)
+    assert grasp.q[1] == pytest.approx(expected, abs=AGAIN_TOL)
+
+
+# ---------------------------------------------------------------- ways to miss
+
+
+def test_an_object_out_of_reach_is_not_touched():
+    scene = Scene(position=(0.0, 0.0, -3.0))
+    missed = GeometricProbe(scene).touch(scene.articulated.home)
+    assert isinstance(missed, Missed)
+    assert missed.reason is Miss.NO_TOUCH
+    assert missed.where in ("finger_1", "finger_2", "finger_3")
+
+
+def test_a_finger_past_the_object_closes_without_touching(tmp_path):
+    distance = LENGTH + 0.05 + TIP + 1e-6
+    assert single(tmp_path, 0.05, distance, 1.5).touch(np.array([0.0, 0.0])) == Missed(
+        Miss.NO_TOUCH, "finger"
+    )
+
+
+def test_an_object_around_the_hand_is_begun_inside_of():
+    scene = Scene("bhand", Cylinder(0.5, height=2.0), (0.0, 0.0, 0.0))
+    missed = GeometricProbe(scene).touch(scene.articulated.home)
+    assert isinstance(missed, Missed)
+    assert missed.reason is Miss.INSIDE
+    assert missed.where in ("finger_1", "finger_2", "finger_3")
+
+
+def test_the_finger_that_misses_is_named(tmp_path):
+    toml = tiny_hand.TOML.replace('name = "finger"', 'name = "little"')
+    folder = tiny_hand.write(tmp_path, STIFF, toml)
+    far, around = Scene(folder, Cylinder(0.05), (3, 0, 0)), Scene(folder, Cylinder(1), (0, 0, 0))
+    assert GeometricProbe(far).touch(np.zeros(2)) == Missed(Miss.NO_TOUCH, "little")
+    assert GeometricProbe(around).touch(np.zeros(2)) == Missed(Miss.INSIDE, "little")
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    """A scene and a grasp in it with links besides the tips in the object."""
+    scene = Scene(object=Cylinder(0.05, TALL))
+    grasp = GeometricProbe(scene).touch(np.array(CROWDED))
+    assert grasp.other_links
+    return scene, grasp
+
+
+def test_other_links_pass_through_the_object_and_are_named(crowded):
+    scene, grasp = crowded
+    again = GeometricProbe(scene, links="pass").touch(grasp.q)
+    assert isinstance(again, Grasp)
+    assert again.other_links == grasp.other_links
+    data = mujoco.MjData(scene.model)
+    scene.articulated.place(data, grasp.q)
+    for name in grasp.other_links:
+        assert name not in ("f1_tip", "f2_tip", "f3_tip", "object")
+        link = scene.model.geom(name)
+        assert link.contype[0] or link.conaffinity[0]
+        gap = mujoco.mj_geomDistance(
+            scene.model, data, link.id, scene.model.geom("object").id, 0.1, None
+        )
+        assert gap < 0.0
+
+
+def test_other_links_can_block_instead(crowded):
+    scene, grasp = crowded
+    missed = GeometricProbe(scene, links="block").touch(grasp.q)
+    assert isinstance(missed, Missed)
+    assert missed.reason is Miss.OTHER_LINK
+    assert missed.where in grasp.other_links
+
+
+def test_where_no_other_link_touches_blocking_changes_nothing(world):
+    clear = [t for g, t in zip(world.grasps, world.targets, strict=True) if not g.other_links]
+    probe = GeometricProbe(world.scene, links="block")
+    assert clear
+    for target in clear[:5]:
+        assert same(probe.touch(target), world.probe.touch(target))
+
+
+def test_every_reason_reads_as_one():
+    assert {miss.value for miss in Miss} == {
+        "a finger closed without touching",
+        "a fingertip began inside the object",
+        "another link touches the object",
+    }
+
+
+# ---------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    "q", [np.zeros(10), np.zeros(12), np.zeros((11, 1)), 0.0, np.full(11, np.nan),
+          np.r_[np.zeros(10), np.inf]],
+    ids=lambda q: str(np.shape(q)),
+)  # fmt: skip
+def test_a_target_is_one_finite_angle_for_each_joint(world, q):
+    with pytest.raises(InputError, match="q_target must be 11 finite angles, for wam_j1, "):
+        world.probe.touch(q)
+
+
+@pytest.mark.parametrize("q", [None, ["a"] * 11, [[0.0] * 5, [0.0] * 6]], ids=str)
+def test_a_target_that_is_no_array_of_numbers_is_refused(world, q):
+    with pytest.raises(InputError, match="q_target"):
+        world.probe.touch(q)
+
+
+def test_an_unknown_way_to_treat_links_lists_the_known_ones(world):
+    with pytest.raises(InputError, match="unknown links 'stop'; choose one of: pass, block"):
+        GeometricProbe(world.scene, links="stop")
+
+
+@pytest.mark.parametrize("flexion", ["[]", '["proximal", "lift"]'])
+def test_a_finger_with_more_or_less_than_one_flexion_joint_is_refused(tmp_path, flexion):
+    toml = change(tiny_hand.TOML, '["proximal"]', flexion)
+    scene = Scene(tiny_hand.write(tmp_path, toml=toml), Cylinder(0.02), (0.1, 0.1, 0.0))
+    with pytest.raises(InputError, match=r"finger has . flexion joints.*one joint a finger"):
+        GeometricProbe(scene)

@@ -1,0 +1,496 @@
+"""A robot read from its folder: couplings, ranges, and the motion of its contact points."""
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import tiny_hand
+from tiny_hand import TOML, XML, change
+
+from hqp_grasp.errors import InputError, ModelError
+from hqp_grasp.world.robot import Robot, RobotDescription
+from hqp_grasp.world.scene import Scene
+
+NAMES = ("bhand", "wam_bhand")
+POSTURES = 10  # random ones, per test
+EXACT = 1e-12  # plain arithmetic on numbers of order one
+AGREEMENT_TOL = 1e-9
+FD_STEP = 1e-5  # [rad] central differences: error about 1e-10
+FD_TOL = 1e-8
+
+TWO_TENDONS = change(
+    change(
+        XML,
+        '<joint name="follow" joint1="distal" joint2="proximal" polycoef="0 0.5 0 0 0"/>',
+        '<tendon name="follow" tendon1="cable" polycoef="0.05 0 0 0 0"/>',
+    ),
+    "  <equality>",
+    """
+  <tendon>
+    <fixed name="cable">
+      <joint joint="proximal" coef="-0.02"/>
+      <joint joint="distal" coef="0.04"/>
+    </fixed>
+  </tendon>
+  <equality>""",
+)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def robot(request):
+    return Scene(robot=request.param).articulated
+
+
+@pytest.fixture(scope="module")
+def data(robot):
+    return mujoco.MjData(robot.model)
+
+
+def postures(robot, seed, count=POSTURES):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(robot.q_lower, robot.q_upper, size=(count, robot.n))
+
+
+def build(folder, xml=XML, toml=TOML):
+    description = RobotDescription.load(tiny_hand.write(folder, xml, toml))
+    return Robot(description, description.spec().compile())
+
+
+# ---------------------------------------------------------------- motion of the contact points
+
+
+def test_the_jacobian_is_the_rate_of_the_centres(robot):
+    for q in postures(robot, seed=0):
+        J = robot.jacobian(q)
+        assert J.shape == (9, robot.n)
+        for j, step in enumerate(FD_STEP * np.eye(robot.n)):
+            ahead = robot.centers(q + step).ravel()
+            behind = robot.centers(q - step).ravel()
+            np.testing.assert_allclose(J[:, j], (ahead - behind) / (2 * FD_STEP), atol=FD_TOL)
+
+
+def test_the_hessian_is_the_rate_of_the_jacobian_and_symmetric(robot):
+    for q in postures(robot, seed=1):
+        H = robot.hessian(q)
+        assert H.shape == (9, robot.n, robot.n)
+        np.testing.assert_allclose(H, H.transpose(0, 2, 1), atol=EXACT)
+        for j, step in enumerate(FD_STEP * np.eye(robot.n)):
+            ahead = robot.jacobian(q + step)
+            behind = robot.jacobian(q - step)
+            np.testing.assert_allclose(H[:, :, j], (ahead - behind) / (2 * FD_STEP), atol=FD_TOL)
+
+
+def test_the_jacobian_is_mujocos_times_the_coupling(robot, data):
+    for q in postures(robot, seed=2):
+        robot.place(data, q)
+        J = robot.jacobian(q)
+        mujoco.mj_forward(robot.model, data)
+        for i, point in enumerate(robot.description.contact_points):
+            full = np.zeros((3, robot.model.nv))
+            mujoco.mj_jacSite(robot.model, data, full, None, robot.model.site(point.site).id)
+            np.testing.assert_allclose(J[3 * i : 3 * i + 3], full @ robot.coupling, atol=EXACT)
+
+
+def test_pinocchio_agrees_on_position_jacobian_and_hessian(robot):
+    model = pin.buildModelFromMJCF(str(robot.description.xml))
+    other = model.createData()
+    names = [robot.model.joint(j).name for j in range(robot.model.njnt)]
+    at = [model.joints[model.getJointId(name)].idx_v for name in names]
+    C = robot.coupling
+    for q in postures(robot, seed=3):
+        pin_q = pin.neutral(model)
+        pin_q[at] = C @ q + robot.offset
+        pin.computeJointKinematicHessians(model, other, pin_q)
+        pin.updateFramePlacements(model, other)
+        x, J, H = robot.centers(q), robot.jacobian(q), robot.hessian(q)
+        for i, point in enumerate(robot.description.contact_points):
+            frame, rows = model.getFrameId(point.site), slice(3 * i, 3 * i + 3)
+            axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            position = other.oMf[frame].translation
+            pin_J = pin.getFrameJacobian(model, other, frame, axes)[:3, at] @ C
+            pin_H = pin.getFrameKinematicHessian(model, other, frame, axes)
+            # Its memory is column-major, but labelled row-major.
+            pin_H = pin_H.ravel().reshape(pin_H.shape, order="F")[:3][:, at][:, :, at]
+            np.testing.assert_allclose(x[i], position, atol=AGREEMENT_TOL)
+            np.testing.assert_allclose(J[rows], pin_J, atol=AGREEMENT_TOL)
+            np.testing.assert_allclose(H[rows], C.T @ pin_H @ C, atol=AGREEMENT_TOL)
+
+
+def test_slides_several_joints_on_a_body_and_fixed_points_move_as_differences_say(tmp_path):
+    xml = change(
+        XML,
+        '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>',
+        """<joint name="lift" type="slide" axis="0.6 0 0.8" range="-0.5 0.5"/>
+           <joint name="yaw" axis="0 0.6 0.8" pos="0.1 0 0.02" range="-1 1"/>
+           <joint name="roll" axis="1 0 0" pos="0 0.03 0" range="-1 1"/>
+           <joint name="push" type="slide" axis="0 1 0" range="-1 1"/>""",
+    )
+    xml = change(xml, 'qpos="0 0.2 0.1"', 'qpos="0 0 0 0 0.2 0.1"')
+    xml = change(
+        xml,
+        "<worldbody>",
+        '<worldbody><geom name="post" type="sphere" size="0.01"/><site name="post"/>',
+    )
+    toml = change(TOML, "lift = 0.1", "lift = 0.1\nyaw = 1\nroll = 1\npush = 1")
+    toml += '[[contact_points]]\nname = "p"\nsite = "post"\ngeom = "post"\nflexion = []\n'
+    robot = build(tmp_path, xml, toml)
+    for q in postures(robot, seed=4):
+        J, H = robot.jacobian(q), robot.hessian(q)
+        np.testing.assert_array_equal(J[3:], 0.0)
+        np.testing.assert_array_equal(H[3:], 0.0)
+        for j, step in enumerate(FD_STEP * np.eye(robot.n)):
+            ahead, J_ahead = robot.centers(q + step).ravel(), robot.jacobian(q + step)
+            behind, J_behind = robot.centers(q - step).ravel(), robot.jacobian(q - step)
+            np.testing.assert_allclose(J[:, j], (ahead - behind) / (2 * FD_STEP), atol=FD_TOL)
+            np.testing.assert_allclose(
+                H[:, :, j], (J_ahead - J_behind) / (2 * FD_STEP), atol=FD_TOL
+            )
+
+
+def test_the_tiny_finger_is_where_trigonometry_puts_it(tmp_path):
+    robot = build(tmp_path)
+    for q in postures(robot, seed=5):
+        lift, angle = q
+        bent = 1.5 * angle
+        x = [0.06 * np.cos(angle) + 0.04 * np.cos(bent), 0.06 * np.sin(angle) + 0.04 * np.sin(bent)]
+        np.testing.assert_allclose(robot.centers(q), [[*x, lift]], atol=EXACT)
+        np.testing.assert_allclose(robot.palm(q)[1][:, 2], [0, 0, 1], atol=EXACT)
+
+
+# ---------------------------------------------------------------- couplings
+
+
+def test_the_barrett_couplings_are_a_third_and_a_mirror(robot):
+    names = [robot.model.joint(j).name for j in range(robot.model.njnt)]
+    drivers = {name: (name, 1.0) for name in robot.joints}
+    drivers["bhand_f2_spread"] = ("bhand_f1_spread", 1.0)
+    for i in (1, 2, 3):
+        drivers[f"bhand_f{i}_distal"] = (f"bhand_f{i}_proximal", 1 / 3)
+    C = np.zeros((len(names), robot.n))
+    for row, name in enumerate(names):
+        driver, ratio = drivers[name]
+        C[row, robot.joints.index(driver)] = ratio
+    np.testing.assert_allclose(robot.coupling, C, atol=EXACT)
+    np.testing.assert_array_equal(robot.offset, np.zeros(len(names)))
+    assert robot.n == {"bhand": 4, "wam_bhand": 11}[robot.description.name]
+
+
+def equality_residual(robot, q):
+    """How far MuJoCo itself finds its equality constraints violated at C q + c₀."""
+    data = mujoco.MjData(robot.model)
+    robot.place(data, q)
+    mujoco.mj_forward(robot.model, data)
+    assert data.ne == robot.model.neq
+    return np.abs(data.efc_pos[: data.ne]).max()
+
+
+@pytest.mark.parametrize(
+    ("xml", "ratio", "offset"),
+    [
+        pytest.param(XML, 0.5, 0.0, id="joint"),
+        pytest.param(change(XML, "0 0.5 0 0 0", "0.07 -0.25 0 0 0"), -0.25, 0.07, id="offset"),
+        # MuJoCo measures both joints from their reference positions.
+        pytest.param(
+            change(
+                change(XML, 'range="0 3"', 'range="0 3" ref="0.3"'),
+                'range="-0.1 0.8"',
+                'range="-0.1 0.8" ref="0.2"',
+            ),
+            0.5,
+            0.2 - 0.5 * 0.3,
+            id="reference",
+        ),
+        pytest.param(change(XML, ' joint2="proximal"', ""), 0.0, 0.0, id="held"),
+        # −0.02 q_p + 0.04 q_d = 0.05
+        pytest.param(TWO_TENDONS, 0.5, 1.25, id="tendon"),
+        pytest.param(
+            change(
+                change(
+                    TWO_TENDONS,
+                    'tendon1="cable" polycoef="0.05 0 0 0 0"',
+                    'tendon1="cable" tendon2="drive" polycoef="0.05 0.1 0 0 0"',
+                ),
+                "  </tendon>",
+                '<fixed name="drive"><joint joint="proximal" coef="1"/></fixed>\n  </tendon>',
+            ),
+            3.0,
+            1.25,
+            id="two tendons",
+        ),
+        pytest.param(
+            change(
+                change(TWO_TENDONS, 'range="0 3"', 'range="0 3" ref="0.3"'),
+                'range="-0.1 0.8"',
+                'range="-0.1 0.8" ref="0.2"',
+            ),
+            0.5,
+            0.2 - 0.5 * 0.3 + 1.25,
+            id="tendon reference",
+        ),
+    ],
+)
+def test_couplings_come_from_joint_and_tendon_equalities(tmp_path, xml, ratio, offset):
+    robot = build(tmp_path, xml)
+    assert robot.joints == ("lift", "proximal")
+    np.testing.assert_allclose(robot.coupling, [[1, 0], [0, 1], [0, ratio]], atol=EXACT)
+    np.testing.assert_allclose(robot.offset, [0, 0, offset], atol=EXACT)
+    rng = np.random.default_rng(6)
+    for q in rng.uniform(-1, 1, size=(POSTURES, 2)):
+        assert equality_residual(robot, q) < EXACT
+
+
+def test_a_coupling_driven_by_a_coupled_joint_is_carried_to_the_independent_one(tmp_path):
+    xml = change(
+        XML,
+        '<geom name="tip"',
+        """<body name="last"><inertial mass="1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>
+           <joint name="last" axis="0 0 1" range="-1 1"/></body>
+           <geom name="tip\"""",
+    )
+    xml = change(
+        xml,
+        "  <equality>",
+        '  <equality>\n<joint joint1="last" joint2="distal" polycoef="0.1 2 0 0 0"/>',
+    )
+    robot = build(tmp_path, change(xml, 'qpos="0 0.2 0.1"', 'qpos="0 0.2 0.1 0.3"'))
+    np.testing.assert_allclose(robot.coupling[:, 1], [0, 1, 0.5, 1.0], atol=EXACT)
+    np.testing.assert_allclose(robot.offset, [0, 0, 0, 0.1], atol=EXACT)
+    assert equality_residual(robot, np.array([0.1, 0.4])) < EXACT
+
+
+def test_an_equality_that_is_switched_off_couples_nothing(tmp_path):
+    xml = change(XML, '<joint name="follow"', '<joint name="follow" active="false"')
+    robot = build(tmp_path, xml, change(TOML, "lift = 0.1", "lift = 0.1\ndistal = 1.0"))
+    assert robot.joints == ("lift", "proximal", "distal")
+    np.testing.assert_array_equal(robot.coupling, np.eye(3))
+
+
+# ---------------------------------------------------------------- ranges
+
+
+def test_the_ranges_of_q_keep_every_coupled_joint_inside_exactly(robot):
+    for q in (robot.q_lower, robot.q_upper, robot.home):
+        full = robot.coupling @ q + robot.offset
+        assert (full >= robot.lower).all() and (full <= robot.upper).all()
+        assert robot.violation(q) == 0.0
+    # and are no smaller than that asks: one step further leaves some range
+    for j in range(robot.n):
+        for end, way in ((robot.q_lower, -1.0), (robot.q_upper, 1.0)):
+            q = end.copy()
+            q[j] += way * 1e-14
+            assert robot.violation(q) > 0.0
+
+
+def test_the_distal_range_ends_the_closing_before_the_proximal_one_does(robot):
+    proximal = robot.index("bhand_f3_proximal")
+    np.testing.assert_allclose(np.degrees(robot.q_upper[proximal]), 135.0, atol=EXACT * 100)
+
+
+def test_random_ratios_and_offsets_never_leave_a_range_by_rounding(tmp_path):
+    """The ends are exact in floating point, not up to an ulp."""
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        ratio = rng.choice([-1, 1]) * rng.uniform(0.1, 3)
+        rest = rng.uniform(-0.5, 0.5)
+        middle = ratio * rng.uniform(0.5, 2.5) + rest  # where the proximal joint is inside its own
+        low, high = middle - rng.uniform(0.05, 0.5), middle + rng.uniform(0.05, 0.5)
+        xml = change(XML, "0 0.5 0 0 0", f"{rest:.17g} {ratio:.17g} 0 0 0")
+        robot = build(tmp_path, change(xml, "-0.1 0.8", f"{low:.17g} {high:.17g}"))
+        for q in (robot.q_lower, robot.q_upper):
+            assert robot.violation(q) == 0.0
+        for share in rng.uniform(size=5):
+            q = robot.q_lower + share * (robot.q_upper - robot.q_lower)
+            assert robot.violation(q) == 0.0
+        ends = sorted(((low - rest) / ratio, (high - rest) / ratio))
+        assert robot.q_lower[1] == pytest.approx(max(0.0, ends[0]), abs=EXACT)
+        assert robot.q_upper[1] == pytest.approx(min(3.0, ends[1]), abs=EXACT)
+
+
+def test_violation_is_what_the_worst_joint_exceeds_its_range_by(tmp_path):
+    robot = build(tmp_path)
+    assert robot.violation(np.array([0.0, 1.0])) == 0.0
+    assert robot.violation(np.array([0.6, 1.0])) == pytest.approx(0.1, abs=EXACT)
+    assert robot.violation(np.array([0.0, -0.15])) == pytest.approx(0.15, abs=EXACT)
+    assert robot.violation(np.array([0.0, 2.0])) == pytest.approx(0.2, abs=EXACT)  # distal at 1.0
+
+
+def test_a_joint_without_a_range_is_never_outside(tmp_path):
+    xml = change(XML, '<joint name="proximal" axis="0 0 1" range="0 3"/>',
+                 '<joint name="proximal" axis="0 0 1"/>')  # fmt: skip
+    xml = change(xml, ' range="-0.1 0.8"', "")
+    robot = build(tmp_path, xml)
+    assert robot.q_lower[1] == -np.inf and robot.q_upper[1] == np.inf
+    assert robot.violation(np.array([0.0, 1e6])) == 0.0
+
+
+def test_home_velocity_flexion_and_radius_are_the_files(tmp_path):
+    robot = build(tmp_path)
+    np.testing.assert_array_equal(robot.home, [0.0, 0.2])
+    np.testing.assert_array_equal(robot.velocity, [0.1, 2.0])
+    np.testing.assert_array_equal(robot.tip_radius, [0.01])
+    assert robot.flexion == ((1,),)
+    assert robot.index("proximal") == 1
+    assert robot.description.name == tmp_path.name
+
+
+def test_a_new_hand_is_a_folder_named_by_its_path_or_as_text(tmp_path):
+    folder = tiny_hand.write(tmp_path)
+    assert Scene(robot=folder).articulated.joints == ("lift", "proximal")
+    assert Scene(robot=str(folder)).articulated.joints == ("lift", "proximal")
+
+
+# ---------------------------------------------------------------- errors
+
+
+def test_an_unknown_robot_lists_the_known_ones():
+    with pytest.raises(InputError, match=r"unknown robot 'shadow'.*bhand, wam_bhand"):
+        RobotDescription.load("shadow")
+
+
+def test_a_robot_that_is_neither_name_nor_path_lists_the_known_ones():
+    with pytest.raises(InputError, match="robot"):
+        RobotDescription.load(3)
+
+
+def test_a_folder_without_robot_toml_is_no_robot(tmp_path):
+    with pytest.raises(ModelError, match=r"no robot\.toml"):
+        RobotDescription.load(tmp_path)
+
+
+@pytest.mark.parametrize("entry", ["model", "home", "palm", "arm", "velocity", "contact_points"])
+def test_a_missing_entry_is_named(tmp_path, entry):
+    if entry in ("model", "home", "palm", "arm"):
+        toml = "\n".join(line for line in TOML.splitlines() if not line.startswith(entry))
+    elif entry == "velocity":
+        toml = change(TOML, "[velocity]", "[speeds]")
+    else:
+        toml = change(TOML, "[[contact_points]]", "[[points]]")
+    with pytest.raises(ModelError, match=rf"robot\.toml lacks the entry '{entry}'"):
+        build(tmp_path, toml=toml)
+
+
+@pytest.mark.parametrize("entry", ["name", "site", "geom", "flexion"])
+def test_a_contact_points_missing_entry_is_named(tmp_path, entry):
+    head, points = TOML.split("[[contact_points]]")
+    points = "\n".join(line for line in points.splitlines() if not line.startswith(entry))
+    with pytest.raises(ModelError, match=rf"robot\.toml lacks the entry '{entry}'"):
+        build(tmp_path, toml=f"{head}[[contact_points]]\n{points}")
+
+
+def test_a_robot_toml_that_is_not_toml_is_refused(tmp_path):
+    with pytest.raises(ModelError, match=r"robot\.toml is not valid TOML"):
+        build(tmp_path, toml="model = tiny.xml")
+
+
+@pytest.mark.parametrize("velocity", ['"slow"', "-0.1", "0", "nan", "inf"])
+def test_a_velocity_that_is_no_number_above_zero_is_refused(tmp_path, velocity):
+    with pytest.raises(ModelError, match="velocity"):
+        build(tmp_path, toml=change(TOML, "lift = 0.1", f"lift = {velocity}"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[velocity]\nlift = 0.1\nproximal = 2.0", "velocity = 2.0"),
+        ('arm = ["lift"]', "arm = 1"),
+        ('model = "tiny.xml"', "model = 1"),
+        ('flexion = ["proximal"]', "flexion = 1"),
+        ('site = "tip_center"', "site = 1"),
+    ],
+)
+def test_entries_of_the_wrong_kind_are_refused(tmp_path, old, new):
+    with pytest.raises(ModelError, match=r"robot\.toml"):
+        build(tmp_path, toml=change(TOML, old, new))
+
+
+def test_an_mjcf_that_is_missing_or_broken_is_named(tmp_path):
+    with pytest.raises(ModelError, match=r"tiny\.xml is not a valid MJCF"):
+        build(tmp_path, xml="<mujoco>")
+    with pytest.raises(ModelError, match=r"gone\.xml is not a valid MJCF"):
+        build(tmp_path, toml=change(TOML, "tiny.xml", "gone.xml"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('site = "tip_center"', 'site = "tip"', "no site 'tip' in .*sites are: palm, tip_center"),
+        ('geom = "tip"', 'geom = "nail"', "no geom 'nail' in .*geoms are: tip"),
+        ('palm = "palm"', 'palm = "hand"', "no site 'hand' in .*sites are: palm, tip_center"),
+        ('home = "home"', 'home = "rest"', "no keyframe 'rest' in .*keyframes are: home"),
+        ('arm = ["lift"]', 'arm = ["hoist"]', "no independent joint 'hoist'.*lift, proximal"),
+        ("lift = 0.1", "hoist = 0.1", "no independent joint 'hoist'.*lift, proximal"),
+        ('["proximal"]', '["distal"]', "no independent joint 'distal'.*lift, proximal"),
+        ('palm = "palm"', 'palm = "palm"\nadduction = "spread"', "no independent joint 'spread'"),
+        ("lift = 0.1", "", "gives no velocity for .*'lift'"),
+    ],
+)
+def test_a_name_that_the_model_lacks_comes_with_those_it_has(tmp_path, old, new, message):
+    with pytest.raises(ModelError, match=message):
+        build(tmp_path, toml=change(TOML, old, new))
+
+
+def test_where_there_is_nothing_to_choose_from_the_message_says_none(tmp_path):
+    xml = XML[: XML.index("  <keyframe>")] + "</mujoco>"
+    with pytest.raises(ModelError, match=r"no keyframe 'home' in .*keyframes are: none"):
+        build(tmp_path, xml)
+
+
+@pytest.mark.parametrize("qpos", ["0 0.2", "0 0.2 0.1 0.3"])
+def test_a_keyframe_of_the_wrong_length_is_refused(tmp_path, qpos):
+    """MuJoCo refuses one that is too long, and fills one that is too short with zeros."""
+    folder = tiny_hand.write(tmp_path, change(XML, 'qpos="0 0.2 0.1"', f'qpos="{qpos}"'))
+    with pytest.raises((InputError, ModelError), match=r"keyframe 'home'.*3"):
+        Scene(robot=folder).articulated  # noqa: B018
+
+
+@pytest.mark.parametrize("joint", ['<freejoint name="lift"/>', '<joint name="lift" type="ball"/>'])
+def test_only_hinges_and_slides_are_accepted(tmp_path, joint):
+    xml = change(XML, '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>', joint)
+    qpos = "1 " + "0 " * (3 if "ball" in joint else 6)
+    xml = change(xml, 'qpos="0 0.2 0.1"', f'qpos="{qpos} 0.2 0.1"')
+    with pytest.raises(ModelError, match=r"joint 'lift' of .* is neither hinge nor slide"):
+        build(tmp_path, xml)
+
+
+def test_a_nonlinear_coupling_is_refused_by_name(tmp_path):
+    with pytest.raises(ModelError, match="equality follow is not linear"):
+        build(tmp_path, change(XML, "0 0.5 0 0 0", "0 0.5 0.1 0 0"))
+
+
+def test_couplings_that_contradict_one_another_are_refused(tmp_path):
+    again = '<joint joint1="distal" joint2="proximal" polycoef="0 0.3 0 0 0"/>'
+    with pytest.raises(ModelError, match="contradict or repeat"):
+        build(tmp_path, change(XML, "  <equality>", f"  <equality>\n    {again}"))
+
+
+def test_a_coupling_through_a_tendon_that_is_not_fixed_is_refused(tmp_path):
+    head, tail = TWO_TENDONS.split('<fixed name="cable">')
+    tail = tail[tail.index("</fixed>") + len("</fixed>") :]
+    spatial = '<spatial name="cable"><site site="palm"/><site site="tip_center"/></spatial>'
+    with pytest.raises(ModelError, match="tendon 'cable' couples joints but is not fixed"):
+        build(tmp_path, head + spatial + tail)
+
+
+def test_a_tip_that_is_no_sphere_is_refused(tmp_path):
+    xml = change(XML, 'type="sphere" size="0.01"', 'type="box" size="0.01 0.01 0.01"')
+    with pytest.raises(ModelError, match=r"geom 'tip' of .* must be a sphere"):
+        build(tmp_path, xml)
+
+
+@pytest.mark.parametrize("where", ["0.03 0 0", "0.04 0 0.001"])
+def test_a_site_beside_the_centre_of_its_tip_is_refused(tmp_path, where):
+    """Contact positions are computed from the site, gaps from the geom: they must coincide."""
+    xml = change(
+        XML, '<site name="tip_center" pos="0.04 0 0"/>', f'<site name="tip_center" pos="{where}"/>'
+    )
+    with pytest.raises(ModelError, match="tip_center"):
+        build(tmp_path, xml)
+
+
+@pytest.mark.parametrize(
+    "q", [[0.0], [0.0, 0.0, 0.0], [[0.0, 0.0]], [np.nan, 0.0], [0.0, np.inf]], ids=str
+)
+def test_q_must_be_one_finite_angle_for_each_joint(tmp_path, q):
+    robot = build(tmp_path)
+    with pytest.raises(InputError, match="q_target must be 2 finite angles, for lift, proximal"):
+        robot.require_q("q_target", q)
