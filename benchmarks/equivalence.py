@@ -15,7 +15,7 @@ import tyro
 from limits import WORSE, force_left, steps
 
 import hqp_grasp as hg
-from hqp_grasp.experiments.trial import TOUCH_RANK
+from hqp_grasp.control.forms import TOUCH_RANK
 
 OBJECTS = {
     "cylinder, 5 cm": hg.Cylinder(radius=0.05),
@@ -84,7 +84,7 @@ def main(
             stack = stack.within(cap, hg.ConfigurationLimit(scene.articulated))
             row = seen[shape, name] = Seen()
             for i in range(trials):
-                record = hg.Trial(scene, stack, probes, hqp=hqp).run((seed, i), probe)
+                record = hg.Trial(scene, stack, probes, hg.HierarchyForm(hqp)).run((seed, i), probe)
                 row.lost += record.lost
                 for grasp in record.grasps:
                     row.add(stack, grasp, hqp)

@@ -18,9 +18,8 @@ import numpy as np
 import tyro
 
 import hqp_grasp as hg
+from hqp_grasp.control.forms import FORMS, SR_DAMPING, TOUCH_RANK, clip_to_limits, form_of
 from hqp_grasp.control.paper import paper_levels
-from hqp_grasp.experiments.start import first_touch
-from hqp_grasp.experiments.trial import FORMS, SR_DAMPING, TOUCH_RANK, Record, clip_to_limits
 
 WORSE = 1e-6  # [N] more than the hierarchy leaves
 OBJECT = hg.Cylinder(radius=0.05)
@@ -75,17 +74,18 @@ def main(
     probe = hg.GeometricProbe(scene)
     hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK)
     laws = hg.stack_of("fmk")
-    runs: dict[str, list[Record]] = {form: [] for form in FORMS}
+    runs: dict[str, list[hg.Record]] = {form: [] for form in FORMS}
     left: dict[str, list[float]] = {}
     outside: dict[str, float] = {}
     felt_outside, active = 0.0, 0
     for i in range(trials):
         rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
-        q_start = first_touch(scene, probe, rng).grasp.q
+        q_start = hg.Start().draw(scene, lambda _: probe, rng).grasp.q
         robot = narrowed(joint, q_start[scene.articulated.index(joint)], half_width)
         stack = laws.within(hg.StepLimit(), hg.ConfigurationLimit(robot))
-        for form in FORMS:
-            runs[form].append(hg.Trial(scene, stack, probes, form, hqp).run((seed, i)))
+        for name in FORMS:
+            trial = hg.Trial(scene, stack, probes, form_of(name, solver))
+            runs[name].append(trial.run((seed, i)))
         record = runs["hierarchy"][-1]
         active += int(record.column("limit_active").sum())
         felt_outside = max(felt_outside, *(robot.violation(grasp.q) for grasp in record.grasps))

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import hqp_grasp as hg
-from hqp_grasp.experiments.trial import TOUCH_RANK, Record
+from hqp_grasp.control.forms import TOUCH_RANK
 from hqp_grasp.grasp import Missed
 from hqp_grasp.touch.geometric import GeometricProbe
 
@@ -35,7 +35,7 @@ class TimedProbe:
         self.calls.append((begin, time.perf_counter(), touched))
         return touched
 
-    def since(self, record: Record) -> tuple[list[float], list[float]]:
+    def since(self, record: hg.Record) -> tuple[list[float], list[float]]:
         """Seconds of each touch after the first grasp of `record`, and of each whole cycle."""
         first = next(i for i, call in enumerate(self.calls) if call[2] is record.grasps[0])
         ends = [end for _, end, _ in self.calls[first:]]
@@ -66,7 +66,7 @@ def main(seed: int = 0, trials: int = 5, probes: int = 40, solver: str = "proxqp
     robot = scene.articulated
     stack = hg.stack_of("fmk").within(hg.StepLimit(), hg.ConfigurationLimit(robot))
     hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK)
-    trial = hg.Trial(scene, stack, probes, hqp=hqp)
+    trial = hg.Trial(scene, stack, probes, hg.HierarchyForm(hqp))
     trial.run((seed, trials))  # compiles and fills caches
     touches: list[float] = []
     cycles: list[float] = []

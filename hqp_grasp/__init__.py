@@ -1,5 +1,7 @@
 """Grasping by touch, with control laws in strict order and within a robot's limits."""
 
+from hqp_grasp.control.controller import Controller, Step
+from hqp_grasp.control.forms import ClippedForm, HierarchyForm, PaperForm
 from hqp_grasp.control.ik import ik_levels, solve_ik
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
 from hqp_grasp.errors import (
@@ -11,12 +13,15 @@ from hqp_grasp.errors import (
     SingularTaskError,
     SolverError,
 )
+from hqp_grasp.experiments.record import Record
+from hqp_grasp.experiments.start import Start
 from hqp_grasp.experiments.study import Study
-from hqp_grasp.experiments.trial import Record, Trial
-from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
+from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP, solvers
 from hqp_grasp.hierarchy.level import Level, LevelReport, Solution
 from hqp_grasp.hierarchy.projection import Projection
+from hqp_grasp.history import load_history, save_history
 from hqp_grasp.tasks import (
     ContactSpaceTask,
     ContactTask,
@@ -38,14 +43,17 @@ from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
 __all__ = [
     "HQP",
+    "ClippedForm",
     "ConfigurationLimit",
     "Contact",
     "ContactSpaceTask",
     "ContactTask",
+    "Controller",
     "Cylinder",
     "ForceTask",
     "GeometricProbe",
     "Grasp",
+    "HierarchyForm",
     "HqpGraspError",
     "InputError",
     "KinematicTask",
@@ -57,6 +65,7 @@ __all__ = [
     "Missed",
     "ModelError",
     "MomentTask",
+    "PaperForm",
     "PostureTask",
     "Priority",
     "Prism",
@@ -72,12 +81,17 @@ __all__ = [
     "Solution",
     "SolverError",
     "Stack",
+    "Start",
+    "Step",
     "StepLimit",
     "Study",
     "Task",
+    "Touch",
     "Trial",
     "VelocityLimit",
     "ik_levels",
+    "load_history",
+    "save_history",
     "solve_ik",
     "solvers",
     "stack_of",

@@ -174,3 +174,20 @@ class Missed:
 
     reason: Miss
     where: str  # the contact point or link
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """One probe: where the hand was sent, and what it felt there."""
+
+    q_target: np.ndarray  # (n,) independent joints [rad]
+    felt: Grasp | Missed
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "q_target", as_array("Touch.q_target", self.q_target, (None,)))
+        if not isinstance(self.felt, Grasp | Missed):
+            raise InputError(f"Touch.felt must be a Grasp or a Missed; got {self.felt!r}")
+        if isinstance(self.felt, Grasp) and self.felt.n != len(self.q_target):
+            raise InputError(
+                f"Touch.q_target has {len(self.q_target)} joints, its grasp {self.felt.n}"
+            )

@@ -12,7 +12,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 # A block of Python, and the block of text that stands right below it where there is one.
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
 EXAMPLES = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page in PAGES}
-SHOWN_ON = ["CONTRIBUTING.md", "README.md", "mink.md", "quickstart.md", "solver.md"]
+SHOWN_ON = ["CONTRIBUTING.md", "README.md", "mink.md", "own-hand.md", "quickstart.md", "solver.md"]
 
 
 def test_the_pages_that_show_code_are_all_found():
@@ -20,7 +20,8 @@ def test_the_pages_that_show_code_are_all_found():
 
 
 @pytest.mark.parametrize("page", SHOWN_ON)
-def test_examples_run_and_print_what_the_page_shows(page):
+def test_examples_run_and_print_what_the_page_shows(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}  # a page's later blocks go on from its earlier ones
     for code, shown in EXAMPLES[page]:
         printed = io.StringIO()

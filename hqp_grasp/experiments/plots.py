@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 
-from hqp_grasp.experiments.trial import CONVERGED_FORCE, CONVERGED_MOMENT
+from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 
 FORCE, MOMENT, ANGLE = "#0072b2", "#d55e00", "#009e73"
 FLOOR = 1e-16  # errors below are drawn here

@@ -11,12 +11,13 @@ import numpy as np
 import pyarrow as pa
 import tyro
 
+from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import HqpGraspError
 from hqp_grasp.experiments.plots import convergence
+from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 from hqp_grasp.experiments.study import Study
-from hqp_grasp.experiments.trial import CONVERGED_FORCE, CONVERGED_MOMENT, TOUCH_RANK, Trial
-from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.tasks import stack_of
 from hqp_grasp.world.scene import Scene
 
@@ -82,8 +83,7 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
         scene=scene,
         stack=stack,
         probes=settings.probes,
-        form=settings.form,
-        hqp=HQP(settings.solver, rank_tolerance=TOUCH_RANK),
+        form=form_of(settings.form, settings.solver),
         landing=settings.landing,
         links=settings.links,
     )

@@ -1,13 +1,14 @@
-"""The paper's random starting postures: the palm faces the object from a drawn side and height."""
+"""Random starting postures as in the paper: the palm faces the object from a drawn side."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import ReachError
+from hqp_grasp.errors import InputError, ReachError
 from hqp_grasp.grasp import Grasp, Miss
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
@@ -15,62 +16,83 @@ from hqp_grasp.touch.probe import Probe
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
-ADDUCTION = (np.radians(10.0), np.radians(90.0))  # [rad] (paper, section 4)
-ELEVATION = (np.radians(30.0), np.radians(50.0))  # [rad] of the approach axis below horizontal
-OFFSET = (-0.18, 0.18)  # [m] of the palm from the object's axis, in x and in y
-ADVANCE = 0.01  # [m] the palm comes nearer by, while the fingers do not reach
 UPRIGHT = 0.05  # [–] vertical part of the normal of an upright side, at most
-MAX_DRAWS = 500  # draws before the object counts as out of reach
 MAX_IK_STEPS = 60
 IK_STEP = 0.3  # [rad]
 IK_TOLERANCE = 1e-4  # [m, rad]
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """A first touch, and what it took to find it."""
+class FirstTouch:
+    """Where a trial begins, and what it took to find it."""
 
+    scene: Scene  # the scene asked for; a hand without an arm has been placed in it
     grasp: Grasp
     rejected: int  # draws from which the hand could not touch
 
 
-def first_touch(scene: Scene, probe: Probe, rng: np.random.Generator) -> Start:
-    """Draw postures until the hand touches with every finger.
+@dataclass(frozen=True)
+class Start:
+    """Draws postures until the hand touches with every finger.
 
-    Adduction, elevation and horizontal offset of the palm are uniform over the paper's ranges.
-    What the paper leaves open: the approach axis meets the object's axis at its middle, from the
-    robot's side (a draw beyond the object is mirrored), the opposition axis is horizontal, and
-    the palm advances along the approach axis, by ADVANCE at a time, until all fingers reach. A
-    draw is rejected where the arm cannot go, a fingertip meets an edge or the top instead of the
-    upright side, or another link touches too.
-    Raises ReachError after MAX_DRAWS draws without a touch.
+    Adduction, elevation and horizontal offset of the palm are uniform over the ranges; the
+    defaults are the paper's (section 4). What it leaves open: the approach axis meets the object's
+    axis at its middle, from the robot's side (a draw beyond the object is mirrored), the
+    opposition axis is horizontal, and the palm advances along the approach axis, by `advance` at a
+    time, until all fingers reach. A draw is rejected where the arm cannot go, a fingertip meets an
+    edge or the top instead of the upright side, or another link touches too. A hand without an arm
+    is placed where the draw says.
     """
-    robot = scene.articulated
-    last = "none"
-    for rejected in range(MAX_DRAWS):
-        adduction = rng.uniform(*ADDUCTION)
-        elevation = rng.uniform(*ELEVATION)
-        offset = np.array([-abs(rng.uniform(*OFFSET)), rng.uniform(*OFFSET)])
-        distance = float(np.linalg.norm(offset))
-        while distance > 0.0:
-            q = _reach(scene, adduction, elevation, distance, offset)
-            if q is None:
-                last = "the arm cannot reach the drawn posture"
-                break
-            touched = probe.touch(q)
-            if isinstance(touched, Grasp):
-                last = _flaw(touched)
-                if not last:
-                    return Start(touched, rejected)
-                break
-            last = f"{touched.reason.value} ({touched.where})"
-            if touched.reason is not Miss.NO_TOUCH:
-                break
-            distance -= ADVANCE * np.cos(elevation)
-    raise ReachError(
-        f"{robot.description.name} touches the object at {scene.position} from none of {MAX_DRAWS} "
-        f"drawn postures (the last: {last}); move the object, or take another"
-    )
+
+    adduction: tuple[float, float] = (np.radians(10.0), np.radians(90.0))  # [rad]
+    elevation: tuple[float, float] = (np.radians(30.0), np.radians(50.0))  # [rad] below horizontal
+    offset: tuple[float, float] = (-0.18, 0.18)  # [m] of the palm from the object, in x and in y
+    advance: float = 0.01  # [m] the palm comes nearer by, while the fingers do not reach
+    max_draws: int = 500  # before the object counts as out of reach
+
+    def __post_init__(self) -> None:
+        for name in ("adduction", "elevation", "offset"):
+            low, high = getattr(self, name)
+            if not -np.inf < low <= high < np.inf:
+                raise InputError(f"Start.{name} must be a range (low, high); got {(low, high)}")
+        if not self.advance > 0.0 or self.max_draws < 1:
+            raise InputError("Start needs an advance above 0 and at least 1 draw")
+
+    def draw(
+        self, scene: Scene, probe_in: Callable[[Scene], Probe], rng: np.random.Generator
+    ) -> FirstTouch:
+        """Return the first touch that a draw finds; raise ReachError after `max_draws` without.
+
+        `probe_in` gives the probe that touches in a scene.
+        """
+        robot = scene.articulated
+        last = "none"
+        for rejected in range(self.max_draws):
+            adduction = rng.uniform(*self.adduction)
+            elevation = rng.uniform(*self.elevation)
+            offset = np.array([-abs(rng.uniform(*self.offset)), rng.uniform(*self.offset)])
+            distance = float(np.linalg.norm(offset))
+            while distance > 0.0:
+                p_palm, z = _palm_goal(scene, elevation, distance, offset)
+                found = _reach(scene, adduction, p_palm, z)
+                if found is None:
+                    last = "the arm cannot reach the drawn posture"
+                    break
+                placed, q = found
+                touched = probe_in(placed).touch(q)
+                if isinstance(touched, Grasp):
+                    last = _flaw(touched)
+                    if not last:
+                        return FirstTouch(placed, touched, rejected)
+                    break
+                last = f"{touched.reason.value} ({touched.where})"
+                if touched.reason is not Miss.NO_TOUCH:
+                    break
+                distance -= self.advance * np.cos(elevation)
+        raise ReachError(
+            f"{robot.description.name} touches the object at {scene.position} from none of "
+            f"{self.max_draws} drawn postures (the last: {last}); move the object, or take another"
+        )
 
 
 def _flaw(grasp: Grasp) -> str:
@@ -83,16 +105,22 @@ def _flaw(grasp: Grasp) -> str:
     return ""
 
 
-def _reach(
-    scene: Scene, adduction: float, elevation: float, distance: float, offset: np.ndarray
-) -> np.ndarray | None:
-    """Joints that bring the palm to `distance` on the side of `offset`, fingers open, or None."""
-    robot = scene.articulated
+def _palm_goal(
+    scene: Scene, elevation: float, distance: float, offset: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the palm goes (3,) [m] and its approach axis (3,), world, on the side of `offset`."""
     heading = -offset / np.linalg.norm(offset)
     z = np.array([*(np.cos(elevation) * heading), -np.sin(elevation)])
-    p_palm = np.array(scene.position) - distance / np.cos(elevation) * z
+    return np.array(scene.position) - distance / np.cos(elevation) * z, z
+
+
+def _reach(
+    scene: Scene, adduction: float, p_palm: np.ndarray, z: np.ndarray
+) -> tuple[Scene, np.ndarray] | None:
+    """Joints that bring the palm to p_palm, fingers open; None where the arm cannot."""
+    robot = scene.articulated
     q = np.clip(robot.home, robot.q_lower, robot.q_upper)
-    fixed = [j for (j,) in robot.flexion]
+    fixed = [j for joints in robot.flexion for j in joints]
     q[fixed] = robot.q_lower[fixed]
     if robot.description.adduction is not None:
         spread = robot.index(robot.description.adduction)
@@ -100,10 +128,21 @@ def _reach(
             return None
         q[spread] = adduction
         fixed.append(spread)
+    p_now, R_now = robot.palm(q)
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
-    x *= np.sign(robot.palm(q)[1][:, 0] @ x) or 1.0
+    x *= np.sign(R_now[:, 0] @ x) or 1.0
     R_palm = np.column_stack([x, np.cross(z, x), z])
+    if not robot.description.arm:
+        turn = R_palm @ R_now.T
+        return scene.rebased(p_palm - turn @ p_now, turn), q
+    return _inverse_kinematics(scene, q, fixed, p_palm, R_palm)
+
+
+def _inverse_kinematics(
+    scene: Scene, q: np.ndarray, fixed: list[int], p_palm: np.ndarray, R_palm: np.ndarray
+) -> tuple[Scene, np.ndarray] | None:
+    robot = scene.articulated
     hqp = HQP()
     free = np.array([j for j in range(robot.n) if j not in fixed], dtype=int)
     keep = np.eye(robot.n)[fixed]
@@ -111,7 +150,7 @@ def _reach(
         p_now, R_now = robot.palm(q)
         error = np.concatenate([p_palm - p_now, _turn(R_now, R_palm)])
         if np.abs(error).max() < IK_TOLERANCE:
-            return q
+            return scene, q
         levels = [
             Level(np.eye(robot.n), *_box(robot, q)),
             Level.equal(keep, np.zeros(len(fixed))),

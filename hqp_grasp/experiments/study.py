@@ -18,12 +18,11 @@ import pyarrow.parquet as pq
 from tqdm import tqdm
 
 from hqp_grasp.errors import InputError, ResultsError
-from hqp_grasp.experiments.trial import COLUMNS, Record, Trial
+from hqp_grasp.experiments.record import Record
+from hqp_grasp.experiments.trial import Trial
 
 VERSIONS = ("hqp_grasp", "numpy", "mujoco", "proxsuite", "daqp", "mink")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-TEXTS = {"outcome", "other_links", "method"}
-FLAGS = {"in_contact", "limit_active"}
 
 
 @dataclass(frozen=True)
@@ -87,32 +86,20 @@ class Study:
 
 
 def _run_one(trial: Trial, seed: int, i: int, parts: Path) -> None:
-    _write(to_table(trial.run((seed, i)), i, seed), _part(parts, i))
+    _write(_table(trial.run((seed, i)), i, seed), _part(parts, i))
 
 
-def to_table(record: Record, trial: int, seed: int) -> pa.Table:
-    """One row a probe; units stand in the schema's field metadata."""
-    count = len(record.rows)
-    columns: dict[str, tuple[pa.DataType, list[object], str]] = {
-        "trial": (pa.int64(), [trial] * count, "number of the trial"),
-        "seed": (pa.int64(), [seed] * count, "trial i draws from SeedSequence([seed, i])"),
-        "probe": (pa.int64(), list(range(count)), "0 is the first touch"),
-        "rejected": (pa.int64(), [record.rejected] * count, "starting postures that did not touch"),
+def _table(record: Record, trial: int, seed: int) -> pa.Table:
+    """The record's table, and which trial of the study it is."""
+    table = record.to_table()
+    meanings = {
+        "trial": "number of the trial",
+        "seed": "trial i draws from SeedSequence([seed, i])",
     }
-    for name, meaning in COLUMNS.items():
-        kind = pa.string() if name in TEXTS else pa.bool_() if name in FLAGS else pa.float64()
-        columns[name] = (kind, [row[name] for row in record.rows], meaning)
-    for j, joint in enumerate(record.joints):
-        angles: list[object] = [float(grasp.q[j]) for grasp in record.grasps]
-        angles += [None] * (count - len(angles))
-        columns[f"q_{joint}"] = (pa.float64(), angles, "rad: joint angle")
-    schema = pa.schema(
-        [
-            pa.field(name, kind, metadata={"meaning": meaning})
-            for name, (kind, _, meaning) in columns.items()
-        ]
-    )
-    return pa.table({name: values for name, (_, values, _) in columns.items()}, schema=schema)
+    for at, (name, value) in enumerate({"trial": trial, "seed": seed}.items()):
+        field = pa.field(name, pa.int64(), metadata={"meaning": meanings[name]})
+        table = table.add_column(at, field, pa.array([value] * len(record.rows), pa.int64()))
+    return table
 
 
 def _part(parts: Path, i: int) -> Path:

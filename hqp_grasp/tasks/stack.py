@@ -80,13 +80,13 @@ class Stack:
             )
 
     @classmethod
-    def of(cls, task: Task) -> Stack:
-        """A stack of one law."""
-        return cls(((task,),))
+    def of(cls, laws: Task | Stack) -> Stack:
+        """A stack of one law, or the stack itself."""
+        return laws if isinstance(laws, Stack) else cls(((_task(laws),),))
 
     def __rshift__(self, other: Task | Stack) -> Stack:
         """`a >> b`: b subject to a."""
-        below = other if isinstance(other, Stack) else Stack.of(_task(other))
+        below = Stack.of(other)
         return replace(
             self,
             priorities=self.priorities + below.priorities,
@@ -96,14 +96,9 @@ class Stack:
 
     def __add__(self, other: Task | Stack) -> Stack:
         """`a + b`: b at the priority of the last laws of a."""
-        if isinstance(other, Stack):
-            if len(other.priorities) != 1:
-                raise InputError(
-                    "`+` puts laws at one priority: add a task, or stacks of one level"
-                )
-            beside = other
-        else:
-            beside = Stack.of(_task(other))
+        beside = Stack.of(other)
+        if len(beside.priorities) != 1:
+            raise InputError("`+` puts laws at one priority: add a task, or stacks of one level")
         return replace(
             self,
             priorities=(*self.priorities[:-1], self.priorities[-1] + beside.priorities[0]),
@@ -121,6 +116,11 @@ class Stack:
                 raise InputError(f"{limit!r} is no limit of hqp_grasp or mink")
             taken.append(limit)
         return replace(self, limits=(*self.limits, *taken))
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """Every law, in order."""
+        return tuple(task for tasks in self.priorities for task in tasks)
 
     @property
     def name(self) -> str:
@@ -151,7 +151,7 @@ class Stack:
 
 def _task(value: object) -> Task:
     if not isinstance(value, Task):
-        raise InputError(f"{value!r} is no control law: `>>` and `+` take tasks and stacks")
+        raise InputError(f"{value!r} is no control law: give a task, or a stack of them")
     return value
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
+from itertools import count
 
 import mujoco
 import numpy as np
@@ -28,12 +30,12 @@ class GeometricProbe:
 
     As in the paper's simulation the object is felt with the fingertips only: other links pass
     through it, and the grasp names them in `other_links`. With `links="block"` such a touch is a
-    Missed instead.
+    Missed instead. Threads may share a probe: each works on data of its own.
     """
 
     scene: Scene
     links: str = "pass"  # or "block"
-    _data: mujoco.MjData = field(init=False, repr=False)
+    _local: threading.local = field(init=False, repr=False)  # each thread's own MjData
     _tips: np.ndarray = field(init=False, repr=False)  # geom ids (k,)
     _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch
     _object: int = field(init=False, repr=False)
@@ -49,7 +51,7 @@ class GeometricProbe:
                     f"{point.name} has {len(joints)} flexion joints; "
                     "the geometric probe closes one joint a finger"
                 )
-        put("_data", mujoco.MjData(model))
+        put("_local", threading.local())
         put("_object", model.geom(OBJECT).id)
         tips = [model.geom(p.geom).id for p in robot.description.contact_points]
         put("_tips", np.array(tips))
@@ -57,6 +59,12 @@ class GeometricProbe:
         links = [g for g in np.flatnonzero(touching) if g != self._object and g not in tips]
         put("_links", np.array(links, dtype=int))
         put("_speed", self._speed_bound())
+
+    @property
+    def _data(self) -> mujoco.MjData:
+        if not hasattr(self._local, "data"):
+            self._local.data = mujoco.MjData(self.scene.model)
+        return self._local.data
 
     def _speed_bound(self) -> np.ndarray:
         # A tip turns about each joint that its flexion drives, at most at that joint's distance
@@ -137,28 +145,9 @@ class GeometricProbe:
         return away / np.linalg.norm(away)
 
     def _grasp(self, q: np.ndarray, others: tuple[str, ...]) -> Grasp:
-        robot, data, model = self.scene.articulated, self._data, self.scene.model
+        robot = self.scene.articulated
         contacts = []
-        for i, point in enumerate(robot.description.contact_points):
+        for center, radius, i in zip(robot.centers(q), robot.tip_radius, count(), strict=False):
             normal = self._normal(i)
-            site = model.site(point.site)
-            contacts.append(
-                Contact(
-                    position=data.site(point.site).xpos - robot.tip_radius[i] * normal,
-                    normal=normal,
-                    name=point.name,
-                    body=model.body(int(site.bodyid[0])).name,
-                    point=site.pos,
-                    flexion=robot.flexion[i],
-                    tip_radius=float(robot.tip_radius[i]),
-                )
-            )
-        return Grasp(
-            q=q,
-            contacts=tuple(contacts),
-            jacobian=robot.jacobian(q),
-            hessian=robot.hessian(q),
-            coupling=robot.coupling,
-            offset=robot.offset,
-            other_links=others,
-        )
+            contacts.append(Contact(center - radius * normal, normal))
+        return robot.grasp(q, contacts, others)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from hqp_grasp.errors import InputError, ModelError, number, one_of
+from hqp_grasp.grasp import Contact, Grasp
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -269,6 +270,46 @@ class Robot:
         site = self.model.site(self.description.palm).id
         mujoco.mj_jacSite(self.model, data, J[:3], J[3:], site)
         return J @ self.coupling
+
+    def grasp(
+        self, q: np.ndarray, contacts: Sequence[Contact], other_links: tuple[str, ...] = ()
+    ) -> Grasp:
+        """A complete grasp from joint angles and what was felt there.
+
+        `contacts` has one Contact for each contact point, in the description's order: position and
+        outward normal (world), perhaps wrench and confidence. Name, link, point and flexion are
+        the robot's, and so are the grasp's Jacobian, Hessian and coupling.
+        """
+        q = self.require_q("Robot.grasp: q", q)
+        points = self.description.contact_points
+        if len(contacts) != len(points):
+            raise InputError(
+                f"{self.description.name} touches with {len(points)} points "
+                f"({', '.join(p.name for p in points)}); got {len(contacts)} contacts"
+            )
+        model = self.model
+        complete = [
+            replace(
+                contact,
+                name=point.name,
+                body=model.body(int(model.site_bodyid[site])).name,
+                point=model.site_pos[site],
+                flexion=flexion,
+                tip_radius=float(radius),
+            )
+            for contact, point, site, flexion, radius in zip(
+                contacts, points, self._sites, self.flexion, self.tip_radius, strict=True
+            )
+        ]
+        return Grasp(
+            q=q,
+            contacts=tuple(complete),
+            jacobian=self.jacobian(q),
+            hessian=self.hessian(q),
+            coupling=self.coupling,
+            offset=self.offset,
+            other_links=other_links,
+        )
 
     def violation(self, q: np.ndarray) -> float:
         """How far the worst joint, independent or coupled, is outside its range [rad]."""

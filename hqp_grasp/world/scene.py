@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, number
+from hqp_grasp.errors import InputError, positive
 from hqp_grasp.grasp import as_array
 from hqp_grasp.world.robot import Robot, RobotDescription
 
 OBJECT = "object"  # name of the object's body and geom in a scene
 OBJECT_COLOUR = (0.85, 0.55, 0.25, 1.0)
-
-
-def _positive(name: str, value: float) -> None:
-    value = number(name, value)
-    if not (np.isfinite(value) and value > 0.0):
-        raise InputError(f"{name} must be above 0 [m]; got {value}")
 
 
 @dataclass(frozen=True)
@@ -33,8 +27,8 @@ class Cylinder:
     height: float = 0.12  # [m]
 
     def __post_init__(self) -> None:
-        _positive("Cylinder.radius", self.radius)
-        _positive("Cylinder.height", self.height)
+        positive("Cylinder.radius", self.radius)
+        positive("Cylinder.height", self.height)
 
     def add_geom(self, spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
         """Put the geom into `body`, centred."""
@@ -54,7 +48,7 @@ class Prism:
     height: float = 0.12  # [m]
 
     def __post_init__(self) -> None:
-        _positive("Prism.height", self.height)
+        positive("Prism.height", self.height)
         try:
             corners = np.asarray(self.polygon, dtype=float)
         except (TypeError, ValueError) as error:
@@ -80,7 +74,7 @@ class Prism:
     @classmethod
     def regular(cls, sides: int, side: float, height: float = 0.12) -> Prism:
         """A regular polygon with sides of `side` [m], one corner on the x axis."""
-        _positive("Prism side", side)
+        positive("Prism side", side)
         if sides < 3:
             raise InputError(f"Prism.regular needs at least 3 sides; got {sides}")
         angles = 2.0 * np.pi * np.arange(sides) / sides
@@ -100,11 +94,15 @@ class Prism:
 
 @dataclass(frozen=True)
 class Scene:
-    """A robot and an object that stands still, its middle at `position`."""
+    """A robot and an object that stands still, its middle at `position`.
+
+    `base` moves the robot away from where its model puts it: a hand without an arm is placed so.
+    """
 
     robot: str | Path = "wam_bhand"
     object: Cylinder | Prism = Cylinder(radius=0.05)
     position: tuple[float, float, float] = (0.72, 0.0, 0.2)  # [m] world
+    base: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # [m], unit quaternion w x y z
 
     def __post_init__(self) -> None:
         if not isinstance(self.object, Cylinder | Prism):
@@ -116,6 +114,10 @@ class Scene:
                 f"Scene.position must be 3 finite numbers; got {self.position!r}"
             ) from error
         object.__setattr__(self, "position", tuple(position.tolist()))
+        base = as_array("Scene.base", self.base, (7,))
+        if abs(np.linalg.norm(base[3:]) - 1.0) > 1e-9:
+            raise InputError(f"Scene.base needs a unit quaternion (w, x, y, z); got {base[3:]}")
+        object.__setattr__(self, "base", tuple(base.tolist()))
         description = RobotDescription.load(self.robot)
         object.__setattr__(self, "_description", description)
 
@@ -125,6 +127,9 @@ class Scene:
         description: RobotDescription = self.__dict__["_description"]
         spec = description.spec()
         try:
+            frame = spec.worldbody.add_frame(pos=self.base[:3], quat=self.base[3:])
+            for root in spec.worldbody.bodies:
+                root.set_frame(frame)
             body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
             self.object.add_geom(spec, body)
             return spec.compile()
@@ -136,6 +141,14 @@ class Scene:
         """The robot as it stands in this scene's model."""
         return Robot(self.__dict__["_description"], self.model)
 
+    def rebased(self, p: np.ndarray, R: np.ndarray) -> Scene:
+        """The same scene, the robot's base moved by x ↦ R x + p, world."""
+        turn, quaternion = np.zeros(4), np.zeros(4)
+        mujoco.mju_mat2Quat(turn, np.ravel(R))
+        mujoco.mju_mulQuat(quaternion, turn, np.array(self.base[3:]))
+        quaternion /= np.linalg.norm(quaternion)
+        return replace(self, base=(*(R @ np.array(self.base[:3]) + p), *quaternion))
+
     def fingerprint(self) -> str:
         """SHA-256 of the compiled model: a robot's folder may change and keep its name."""
         model = self.model
@@ -145,7 +158,7 @@ class Scene:
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.
-        return {"robot": self.robot, "object": self.object, "position": self.position}
+        return {name: getattr(self, name) for name in ("robot", "object", "position", "base")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

@@ -240,7 +240,7 @@ def test_a_folder_of_other_settings_is_said_in_one_line(ran):
 
 
 def test_an_object_out_of_reach_is_said_in_one_line(monkeypatch, tmp_path):
-    monkeypatch.setattr(start, "MAX_DRAWS", 0)
+    monkeypatch.setattr(start, "_reach", lambda *_: None)
     with pytest.raises(SystemExit, match=r"^cylinder: wam_bhand touches the object .* from none"):
         call(*TINY, "--out", tmp_path)
 

@@ -3,14 +3,12 @@
 import dataclasses
 import itertools
 
-import mujoco
 import numpy as np
 import pytest
 import tiny_hand
 
-from hqp_grasp.errors import ReachError
-from hqp_grasp.experiments import start
-from hqp_grasp.experiments.start import first_touch
+from hqp_grasp.errors import InputError, ReachError
+from hqp_grasp.experiments.start import Start
 from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
@@ -45,12 +43,14 @@ def starts(scene, probe):
     return [first_touch(scene, probe, np.random.default_rng(seed)) for seed in SEEDS]
 
 
+def first_touch(scene, probe, rng, start=None):
+    """What a draw finds with one probe, whatever the scene."""
+    return (start or Start()).draw(scene, lambda _: probe, rng)
+
+
 def palm(scene, q):
-    """Position and rotation of the palm site."""
-    data = mujoco.MjData(scene.model)
-    scene.articulated.place(data, q)
-    site = data.site(scene.articulated.description.palm)
-    return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
+    """Position and rotation of the palm."""
+    return scene.articulated.palm(q)
 
 
 def posture(scene, q):
@@ -153,7 +153,7 @@ def test_while_the_fingers_do_not_reach_the_palm_comes_nearer(scene, starts):
     poses = [palm(scene, q) for q in told.targets]
     for (x, R), (x_next, R_next) in itertools.pairwise(poses):
         np.testing.assert_allclose(R_next, R, atol=2 * POSE_TOL)
-        np.testing.assert_allclose(x_next - x, start.ADVANCE * R[:, 2], atol=2 * POSE_TOL)
+        np.testing.assert_allclose(x_next - x, Start().advance * R[:, 2], atol=2 * POSE_TOL)
 
 
 def test_a_posture_is_offered_with_the_fingers_open_and_inside_the_ranges(scene, starts):
@@ -169,30 +169,48 @@ def test_a_posture_is_offered_with_the_fingers_open_and_inside_the_ranges(scene,
 
 
 @pytest.mark.parametrize("position", [(3.0, 0.0, 0.2), (0.7, 0.0, 4.0)])
-def test_an_object_out_of_reach_is_named_with_the_way_out(monkeypatch, position):
-    monkeypatch.setattr(start, "MAX_DRAWS", 2)
+def test_an_object_out_of_reach_is_named_with_the_way_out(position):
     scene = Scene(position=position)
     with pytest.raises(ReachError, match=r"from none of 2 drawn.*cannot reach.*move the object"):
-        first_touch(scene, GeometricProbe(scene), np.random.default_rng(0))
+        first_touch(scene, GeometricProbe(scene), np.random.default_rng(0), Start(max_draws=2))
 
 
-def test_the_last_reason_is_told(monkeypatch, scene):
-    monkeypatch.setattr(start, "MAX_DRAWS", 3)
+def test_the_last_reason_is_told(scene):
     told = Told(then=Missed(Miss.INSIDE, "finger_2"))
     with pytest.raises(ReachError, match=r"began inside the object \(finger_2\)"):
-        first_touch(scene, told, np.random.default_rng(0))
+        first_touch(scene, told, np.random.default_rng(0), Start(max_draws=3))
 
 
-def test_a_hand_that_no_arm_carries_reaches_nothing_by_itself(monkeypatch):
-    monkeypatch.setattr(start, "MAX_DRAWS", 2)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_hand_without_an_arm_is_placed_where_the_draw_says(seed):
     scene = Scene("bhand")
-    with pytest.raises(ReachError, match="bhand touches the object"):
-        first_touch(scene, GeometricProbe(scene), np.random.default_rng(0))
+    found = Start().draw(scene, GeometricProbe, np.random.default_rng(seed))
+    x, R = palm(found.scene, found.grasp.q)
+    adduction, elevation = posture(found.scene, found.grasp.q)
+    assert 10.0 <= adduction <= 90.0 and 30.0 - 1e-6 <= elevation <= 50.0 + 1e-6
+    lever = np.array(scene.position) - x
+    np.testing.assert_allclose(np.cross(lever, R[:, 2]), 0.0, atol=1e-9)
+    np.testing.assert_allclose(R[2, 0], 0.0, atol=1e-9)  # the opposition axis is horizontal
+    again = GeometricProbe(found.scene).touch(found.grasp.q)
+    np.testing.assert_allclose(again.positions, found.grasp.positions, atol=1e-8)
 
 
-def test_a_robot_without_an_adduction_joint_can_be_drawn_for(monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"adduction": (1.0, 0.5)}, r"Start.adduction must be a range \(low, high\)"),
+        ({"elevation": (0.5, np.nan)}, "Start.elevation must be a range"),
+        ({"advance": 0.0}, "an advance above 0"),
+        ({"max_draws": 0}, "at least 1 draw"),
+    ],
+)
+def test_a_malformed_start_is_refused(setting, message):
+    with pytest.raises(InputError, match=message):
+        Start(**setting)
+
+
+def test_a_robot_without_an_adduction_joint_can_be_drawn_for(tmp_path):
     """The lift cannot turn the palm as drawn: out of reach, and no other failure."""
-    monkeypatch.setattr(start, "MAX_DRAWS", 2)
     scene = Scene(tiny_hand.write(tmp_path), Cylinder(0.02), (0.1, 0.1, 0.0))
     with pytest.raises(ReachError, match="cannot reach the drawn posture"):
-        first_touch(scene, GeometricProbe(scene), np.random.default_rng(0))
+        first_touch(scene, GeometricProbe(scene), np.random.default_rng(0), Start(max_draws=2))

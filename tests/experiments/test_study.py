@@ -10,9 +10,9 @@ import pytest
 
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments import study as module
-from hqp_grasp.experiments.study import Study, to_table
-from hqp_grasp.experiments.trial import COLUMNS, Record, Trial
-from hqp_grasp.grasp import Miss, Missed
+from hqp_grasp.experiments.record import COLUMNS, empty_row
+from hqp_grasp.experiments.study import Study
+from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.tasks import stack_of
 from hqp_grasp.world.scene import Cylinder, Scene
 
@@ -128,15 +128,12 @@ def test_the_folder_says_what_was_run(done):
 
 def test_a_lost_trial_has_null_errors_and_rows_to_the_end(trial):
     record = trial.run((SEED, 0))
-    lost = [dict(record.rows[0]), *[dict.fromkeys(COLUMNS) for _ in range(PROBES)]]
-    for row in lost[1:]:
-        row |= {"in_contact": False, "limit_active": False, "limit_violation": 0.0}
-    lost[1]["outcome"] = str(Missed(Miss.NO_TOUCH, "finger_1").reason.value)
-    table = to_table(
-        Record(record.seed, tuple(lost), record.grasps[:1], record.rejected, record.joints), 0, SEED
-    )
+    nothing = [empty_row(trial.scene.articulated, trial.stack) for _ in range(PROBES)]
+    lost = dataclasses.replace(record, rows=(record.rows[0], *nothing), grasps=record.grasps[:1])
+    table = lost.to_table()
     assert table.num_rows == PROBES + 1
-    assert table.column("eps_f").null_count == table.column("q_wam_j1").null_count == PROBES
+    for name in ("eps_f", "error_force", "status_force", "rank_force", "contact_1_x", "q_wam_j1"):
+        assert table.column(name).slice(1).null_count == PROBES
     assert table.column("in_contact").to_pylist() == [True] + PROBES * [False]
 
 

@@ -1,0 +1,132 @@
+"""The controller: from all that was felt so far to where the hand goes next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hqp_grasp.control.forms import Form, Plan, form_of
+from hqp_grasp.control.landing import land
+from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
+from hqp_grasp.errors import HqpGraspError, InputError
+from hqp_grasp.grasp import Grasp, Missed, Touch
+from hqp_grasp.hierarchy.level import Solution
+from hqp_grasp.tasks import Priority, Stack, Task
+from hqp_grasp.world.robot import Robot
+
+SHARES = (1.0, 0.5, 0.25)  # of a step, tried in turn while it misses
+CLIP_TOLERANCE = 1e-9  # [rad] a solver's rounding may leave a range by; more is a bug
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Where to touch next, and why."""
+
+    q_target: np.ndarray | None  # (n,) [rad], within every limit; None: the controller gives up
+    via: tuple[np.ndarray, ...] = ()  # postures (n,) [rad] to pass on the way, fingers open
+    plan: Plan | None = None  # the step that the laws asked for
+    share: float | None = None  # of the plan that is taken
+    reason: str = ""  # why the controller gives up, or takes another step than planned
+
+    @property
+    def solution(self) -> Solution | None:
+        """The solver's answer behind the plan, None where there was nothing to solve."""
+        return None if self.plan is None else self.plan.solution
+
+
+@dataclass(frozen=True)
+class Controller:
+    """Laws within limits, as a rule for the next touch: no scene and no probe are needed.
+
+    `step(history)` is a pure function of what was felt: nothing is remembered between calls, so a
+    run can be stopped, stored (`save_history`) and resumed anywhere.
+
+    form="hierarchy" solves the joint-space hierarchy within its limits; "clipped" takes the strict
+    projection of the same laws, scaled to the caps and clipped to the ranges; "paper" composes
+    gradients in contact space and maps them by the SR-inverse (eq. 11–13), then clips likewise.
+    A `Form` of one's own stands in the place of these names. A stack without caps gets
+    StepLimit(), one without ranges the robot's.
+
+    After a miss the step from the last grasp is taken again, shorter: SHARES of it in turn. Then,
+    or once the `budget` of touches is spent, the controller gives up.
+    """
+
+    robot: Robot
+    stack: Stack | Task
+    form: str | Form = "hierarchy"
+    seed: int = 0
+    budget: int | None = None  # touches in all, the first included
+    landing: bool = True  # correct each step by the hand's kinematics, see `land`
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.robot, Robot):
+            raise InputError(
+                f"Controller.robot must be a Robot, such as Scene().articulated; got {self.robot!r}"
+            )
+        if self.budget is not None and self.budget < 1:
+            raise InputError(f"a budget is at least 1 touch; got {self.budget}")
+        stack = Stack.of(self.stack)
+        if not any(limit.priority is Priority.CAP for limit in stack.limits):
+            stack = stack.within(StepLimit())
+        if not any(limit.priority is Priority.RANGE for limit in stack.limits):
+            stack = stack.within(ConfigurationLimit(self.robot))
+        object.__setattr__(self, "stack", stack)
+        if isinstance(self.form, str):
+            object.__setattr__(self, "form", form_of(self.form))
+        self.form.check(stack)  # type: ignore[union-attr]
+
+    def step(self, history: Sequence[Touch]) -> Step:
+        """Return where to touch next, given every touch so far, hits and misses, in order.
+
+        Raises InputError for an empty history, or one that is not of this robot.
+        """
+        grasp, misses = self._latest(history)
+        if grasp is None:
+            return Step(None, reason="no touch has felt a grasp yet: begin where the hand touches")
+        if self.budget is not None and len(history) >= self.budget:
+            return Step(None, reason=f"the budget of {self.budget} touches is spent")
+        if len(misses) == len(SHARES):
+            last = misses[-1]
+            why = f"{last.reason.value} ({last.where})"
+            return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
+        plan = self.form.plan(self.stack, grasp)  # type: ignore[union-attr,arg-type]
+        share = SHARES[len(misses)]
+        x = share * plan.x
+        if self.landing:
+            x = land(self.robot, self.stack, grasp, x)  # type: ignore[arg-type]
+        return Step(self._clipped(grasp, x), (), plan, share)
+
+    def _latest(self, history: Sequence[Touch]) -> tuple[Grasp | None, list[Missed]]:
+        """The last grasp felt, and the misses since."""
+        if not len(history):
+            raise InputError("the history is empty: it begins with the first touch")
+        misses: list[Missed] = []
+        for touch in reversed(history):
+            if not isinstance(touch, Touch):
+                raise InputError(f"a history holds Touch values; got {touch!r}")
+            if len(touch.q_target) != self.robot.n:
+                raise InputError(
+                    f"a touch has {len(touch.q_target)} joints, {self.robot} has {self.robot.n}: "
+                    "is it of another robot?"
+                )
+            if isinstance(touch.felt, Grasp):
+                return touch.felt, misses[::-1]
+            misses.append(touch.felt)
+        return None, misses[::-1]
+
+    def _clipped(self, grasp: Grasp, x: np.ndarray) -> np.ndarray:
+        """q + x within the ranges, as the very last act: only rounding may be cut."""
+        q = grasp.q + x
+        limits = self.stack.limits  # type: ignore[union-attr]
+        ranges = [v.robot for v in limits if isinstance(v, ConfigurationLimit)]
+        lower = np.max([self.robot.q_lower, *(r.q_lower for r in ranges)], axis=0)
+        upper = np.min([self.robot.q_upper, *(r.q_upper for r in ranges)], axis=0)
+        clipped = np.clip(q, lower, upper)
+        left = np.abs(clipped - q) > CLIP_TOLERANCE
+        started_inside = (grasp.q >= lower) & (grasp.q <= upper)
+        if (left & started_inside).any():
+            worst = np.abs(clipped - q).max()
+            raise HqpGraspError(f"a step left its range by {worst} rad: please report this")
+        return np.where(left, q, clipped)  # a joint that started outside may still be on its way

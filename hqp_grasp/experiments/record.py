@@ -1,0 +1,215 @@
+"""What a trial leaves behind: one row a probe, columns with units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from hqp_grasp.errors import one_of
+from hqp_grasp.grasp import Grasp
+from hqp_grasp.hierarchy.level import Solution
+from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
+from hqp_grasp.tasks.stack import Stack
+from hqp_grasp.world.robot import Robot
+
+CONVERGED_FORCE = 1e-3  # [N²]
+CONVERGED_MOMENT = 2e-3  # √ε_m [N·m]
+
+# Name, unit and meaning of the columns that every probe fills.
+COLUMNS = {
+    "eps_f": "N^2: squared net force of unit contact forces",
+    "eps_m": "(N m)^2: squared net moment about the contact centroid",
+    "eps_k": "rad: mean angle between flexion velocity and normal",
+    "eps_k_eq7": "m/rad: sum of eq. 7 over the contacts",
+    "adduction_deg": "deg: the spread joint's angle",
+    "elevation_deg": "deg: the palm's approach axis below the horizontal",
+    "in_contact": "bool: every finger touches",
+    "outcome": "touch, or why the probe missed",
+    "other_links": "links beside the fingertips that touch the object",
+    "step_share": "share of the planned step that was taken",
+    "limit_active": "bool: a limit holds the step that led here",
+    "limit_violation": "rad: how far the worst joint is outside its range, commanded or reached",
+    "hqp_projection_gap": "rad: largest difference of hierarchy and projection, limits inactive",
+    "solve_us": "us: solving the hierarchy",
+    "method": "the way the solver found the step",
+}
+# The columns that say the same in every row of a trial.
+TRIAL_COLUMNS = {
+    "rejected": "starting postures that did not touch",
+    "error": "what ended the trial, kind and message; null where nothing did",
+}
+# The columns of each law, by its name: error_force, status_force, rank_force.
+LAW_COLUMNS = {
+    "error": "unit of the law: Euclidean norm of its error",
+    "status": "met or nearest: how the law's level came out in the step that led here",
+    "rank": "rank of the law's level in the freedom left to it, in the step that led here",
+}
+# The columns of each contact point, counted from 1: contact_1_x, contact_1_nx.
+CONTACT_COLUMNS = {
+    **{axis: f"m: {axis} of the contact, world" for axis in "xyz"},
+    **{f"n{axis}": f"{axis} of the object's outward unit normal, world" for axis in "xyz"},
+}
+JOINT_COLUMN = "rad: joint angle"
+TEXTS = {"outcome", "other_links", "method", "error"}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Record:
+    """What one trial brought: probes + 1 rows, the first being the first touch.
+
+    A row has the COLUMNS, those of the stack's laws (LAW_COLUMNS), of the robot's contact points
+    (CONTACT_COLUMNS) and joints (`q_` and the joint's name); None where there is nothing.
+    """
+
+    seed: tuple[int, ...]
+    rows: tuple[dict[str, object], ...]
+    grasps: tuple[Grasp, ...]  # every grasp felt, in order
+    rejected: int  # starting postures drawn before that could not touch
+    joints: tuple[str, ...]
+    error: str | None = None  # what ended the trial, kind and message: "SolverError: …"
+
+    def __repr__(self) -> str:
+        if self.error is not None:
+            end = f"ended by {self.error}"
+        elif self.lost:
+            end = "lost"
+        elif self.converged_at is None:
+            end = "not converged"
+        else:
+            end = f"converged at probe {self.converged_at}"
+        return f"<Record of seed {self.seed}: {len(self.rows)} rows, {end}>"
+
+    def column(self, name: str) -> np.ndarray:
+        """One column over the probes; NaN where a number is missing."""
+        one_of("column", name, self.rows[0])
+        values = [row[name] for row in self.rows]
+        return np.array([np.nan if value is None else value for value in values])
+
+    @property
+    def lost(self) -> bool:
+        """True where the trial ended without contact."""
+        return not self.rows[-1]["in_contact"]
+
+    @property
+    def converged_at(self) -> int | None:
+        """First probe from which ε_f ≤ CONVERGED_FORCE and √ε_m ≤ CONVERGED_MOMENT to the end."""
+        force, moment = self.column("eps_f"), np.sqrt(self.column("eps_m"))
+        bad = ~((force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT))
+        last = int(np.flatnonzero(bad)[-1]) if bad.any() else -1
+        return None if last == len(bad) - 1 else last + 1
+
+    def to_table(self) -> pa.Table:
+        """One row a probe; unit and meaning of a column stand in its field's metadata."""
+        count = len(self.rows)
+        values: dict[str, list[object]] = {
+            "probe": list(range(count)),
+            "rejected": [self.rejected] * count,
+            "error": [self.error] * count,
+        }
+        values |= {name: [row[name] for row in self.rows] for name in self.rows[0]}
+        meanings = {"probe": "0 is the first touch", **TRIAL_COLUMNS}
+        fields = [
+            pa.field(name, _kind(name), metadata={"meaning": meanings.get(name) or meaning(name)})
+            for name in values
+        ]
+        return pa.table(values, schema=pa.schema(fields))
+
+    def to_pandas(self) -> Any:
+        """The same as a pandas.DataFrame; pandas is no dependency of hqp_grasp."""
+        try:
+            import pandas  # noqa: F401
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                "Record.to_pandas needs pandas: pip install pandas; "
+                "Record.to_table() is the same as an arrow table"
+            ) from error
+        return self.to_table().to_pandas()
+
+
+def meaning(column: str) -> str:
+    """Unit and meaning of a column that a probe fills."""
+    if column in COLUMNS:
+        return COLUMNS[column]
+    head, _, rest = column.partition("_")
+    if head == "q":
+        return JOINT_COLUMN
+    if head == "contact":
+        return CONTACT_COLUMNS[rest.partition("_")[2]]
+    return LAW_COLUMNS[head]
+
+
+def _kind(column: str) -> pa.DataType:
+    if column in TEXTS or column.startswith("status_"):
+        return pa.string()
+    if column in ("probe", "rejected") or column.startswith("rank_"):
+        return pa.int64()
+    return pa.bool_() if meaning(column).startswith("bool") else pa.float64()
+
+
+def empty_row(robot: Robot, stack: Stack, solution: Solution | None = None) -> dict[str, object]:
+    """Every column of a probe that felt nothing; `solution`, where a step led to it."""
+    points, joints = robot.description.contact_points, robot.joints
+    names = [f"contact_{i + 1}_{c}" for i in range(len(points)) for c in CONTACT_COLUMNS]
+    names += [f"q_{joint}" for joint in joints]
+    nothing = {
+        "in_contact": False,
+        "limit_active": False,
+        "limit_violation": 0.0,
+        "other_links": "",
+    }
+    laws = law_columns(stack, None, solution)
+    return dict.fromkeys(COLUMNS) | nothing | laws | dict.fromkeys(names)
+
+
+def felt_row(
+    robot: Robot, stack: Stack, grasp: Grasp, solution: Solution | None = None
+) -> dict[str, object]:
+    """The columns that a grasp fills, and the laws' levels in the step that led there."""
+    adduction = robot.description.adduction
+    angle = None if adduction is None else float(np.degrees(grasp.q[robot.index(adduction)]))
+    row = empty_row(robot, stack) | {
+        "eps_f": ForceTask().potential(grasp),
+        "eps_m": MomentTask().potential(grasp),
+        "eps_k": float(KinematicTask(error="angle").error(grasp).mean()),
+        "eps_k_eq7": float(KinematicTask(error="eq7").error(grasp).sum()),
+        "adduction_deg": angle,
+        "elevation_deg": float(np.degrees(np.arcsin(-robot.palm(grasp.q)[1][2, 2]))),
+        "in_contact": True,
+        "outcome": "touch",
+        "other_links": ", ".join(grasp.other_links),
+        "limit_violation": robot.violation(grasp.q),
+    }
+    row |= law_columns(stack, grasp, solution)
+    points = [point.name for point in robot.description.contact_points]
+    for i, contact in enumerate(grasp.contacts):
+        if contact.name in points:
+            i = points.index(contact.name)
+        if i < len(points):
+            numbers = [*contact.position.tolist(), *contact.normal.tolist()]
+            row |= {
+                f"contact_{i + 1}_{column}": number
+                for column, number in zip(CONTACT_COLUMNS, numbers, strict=True)
+            }
+    return row | {f"q_{joint}": float(q) for joint, q in zip(robot.joints, grasp.q, strict=True)}
+
+
+def law_columns(stack: Stack, grasp: Grasp | None, solution: Solution | None) -> dict[str, object]:
+    """LAW_COLUMNS of each law: its error at `grasp`, its level in the step that led there.
+
+    Laws at one priority share a level, and so its status and rank. Where a form of stepping has
+    no level for a law ("paper" composes force and moment into one step), both are None.
+    """
+    levels = {level.name: level for level in solution.levels} if solution is not None else {}
+    row: dict[str, object] = {}
+    for tasks in stack.priorities:
+        level = levels.get(" + ".join(task.name for task in tasks))
+        for task in tasks:
+            row[f"error_{task.name}"] = (
+                None if grasp is None else float(np.linalg.norm(task.error(grasp)))
+            )
+            row[f"status_{task.name}"] = None if level is None else level.status
+            row[f"rank_{task.name}"] = None if level is None else level.rank
+    return row

@@ -1,0 +1,62 @@
+"""A history of touches on disk: stored, and read back bit for bit."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
+
+GRASP = ("q", "jacobian", "hessian", "coupling", "offset")
+
+
+def save_history(path: str | Path, history: Sequence[Touch]) -> None:
+    """Write `history` as JSON, whole or not at all; numbers keep their bits."""
+    path = Path(path)
+    part = path.with_suffix(f".{os.getpid()}.part")
+    part.write_text(json.dumps([_plain(touch) for touch in history]))
+    part.replace(path)
+
+
+def load_history(path: str | Path) -> tuple[Touch, ...]:
+    """Read what `save_history` wrote; raise ResultsError where it is something else."""
+    try:
+        touches = json.loads(Path(path).read_text())
+        return tuple(_touch(touch) for touch in touches)
+    except (ValueError, KeyError, TypeError, InputError) as error:
+        raise ResultsError(f"{path} is no history of touches: {error!r}") from error
+
+
+def _plain(touch: Touch) -> dict[str, object]:
+    felt: dict[str, object]
+    if isinstance(touch.felt, Missed):
+        felt = {"reason": touch.felt.reason.name, "where": touch.felt.where}
+    else:
+        grasp = touch.felt
+        felt = {name: _list(getattr(grasp, name)) for name in GRASP}
+        felt["other_links"] = list(grasp.other_links)
+        felt["contacts"] = [
+            {name: _list(value) for name, value in vars(contact).items()}
+            for contact in grasp.contacts
+        ]
+    return {"q_target": touch.q_target.tolist(), "felt": felt}
+
+
+def _touch(plain: dict[str, dict[str, object]]) -> Touch:
+    felt = dict(plain["felt"])
+    if "reason" in felt:
+        return Touch(plain["q_target"], Missed(Miss[str(felt["reason"])], str(felt["where"])))  # type: ignore[arg-type]
+    contacts = [Contact(**contact) for contact in felt.pop("contacts")]  # type: ignore[attr-defined]
+    felt["other_links"] = tuple(felt["other_links"])  # type: ignore[arg-type]
+    return Touch(plain["q_target"], Grasp(contacts=tuple(contacts), **felt))  # type: ignore[arg-type]
+
+
+def _list(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value

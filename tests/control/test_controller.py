@@ -1,0 +1,229 @@
+"""The controller by itself: a pure function of what was felt, without scene or probe."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from hqp_grasp.control.controller import SHARES, Controller
+from hqp_grasp.control.forms import FORMS, form_of
+from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
+from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.grasp import Contact, Miss, Missed, Touch
+from hqp_grasp.history import load_history, save_history
+from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, stack_of
+from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.world.scene import Scene
+
+PROBES = 6
+MISSED = Missed(Miss.NO_TOUCH, "finger_2")
+
+
+class Hand:
+    """A probe that keeps where it was sent and what it felt."""
+
+    def __init__(self, scene):
+        self.inner, self.touches = GeometricProbe(scene), []
+
+    def touch(self, q_target):
+        felt = self.inner.touch(q_target)
+        self.touches.append(Touch(q_target, felt))
+        return felt
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def robot(scene):
+    return scene.articulated
+
+
+@pytest.fixture(scope="module")
+def stack():
+    return stack_of("fmk")
+
+
+@pytest.fixture(scope="module")
+def first(scene, stack):
+    return Trial(scene, stack, probes=1).run((616, 0)).grasps[0]
+
+
+def walk(controller, probe, history, touches):
+    """The history after so many more touches."""
+    history = list(history)
+    for _ in range(touches):
+        step = controller.step(history)
+        history.append(Touch(step.q_target, probe.touch(step.q_target)))
+    return history
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_loop_of_ones_own_goes_where_a_trial_goes_bit_for_bit(scene, robot, stack, first, form):
+    hand = Hand(scene)
+    Trial(scene, stack, probes=PROBES, form=form, start=first).run((616, 0), hand)
+    controller = Controller(robot, stack, form, budget=PROBES + 1)
+    own = walk(controller, GeometricProbe(scene), [Touch(first.q, first)], PROBES)
+    for ours, theirs in zip(own[1:], hand.touches, strict=True):
+        assert ours.q_target.tobytes() == theirs.q_target.tobytes()
+
+
+def test_a_stored_history_is_continued_bit_for_bit(scene, robot, stack, first, tmp_path):
+    probe = GeometricProbe(scene)
+    whole = walk(Controller(robot, stack), probe, [Touch(first.q, first)], PROBES)
+    for stop in range(1, PROBES):
+        save_history(tmp_path / "history.json", whole[:stop])
+        loaded = load_history(tmp_path / "history.json")
+        resumed = walk(Controller(robot, stack), probe, loaded, PROBES + 1 - stop)
+        assert [t.q_target.tobytes() for t in resumed] == [t.q_target.tobytes() for t in whole]
+
+
+def test_a_stored_history_keeps_every_field_of_grasps_and_misses(first, tmp_path):
+    sensed = dataclasses.replace(
+        first.contacts[0], wrench=[0.1, 0.2, 1 / 3, 0.0, -0.0, 1e-300], confidence=0.7
+    )
+    grasp = dataclasses.replace(first, contacts=(sensed, *first.contacts[1:]), other_links=("l",))
+    history = [Touch(first.q, grasp), Touch(first.q + 0.1, Missed(Miss.INSIDE, "finger_1"))]
+    save_history(tmp_path / "h.json", history)
+    back = load_history(str(tmp_path / "h.json"))
+    assert back[1].felt == history[1].felt
+    for name in ("q", "jacobian", "hessian", "coupling", "offset"):
+        assert getattr(back[0].felt, name).tobytes() == getattr(grasp, name).tobytes()
+    assert back[0].felt.other_links == ("l",)
+    for one, other in zip(back[0].felt.contacts, grasp.contacts, strict=True):
+        for field in dataclasses.fields(Contact):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_targets_are_within_the_ranges_and_steps_within_the_caps(scene, robot, stack, first):
+    history = walk(Controller(robot, stack), GeometricProbe(scene), [Touch(first.q, first)], PROBES)
+    for before, after in itertools.pairwise(history):
+        assert robot.violation(after.q_target) == 0.0
+        assert np.abs(after.q_target - before.felt.q).max() <= StepLimit().joint * (1 + 1e-9)
+
+
+def test_misses_shorten_the_step_then_the_controller_gives_up(robot, stack, first):
+    controller = Controller(robot, stack, landing=False)
+    history = [Touch(first.q, first)]
+    steps = []
+    for share in SHARES:
+        step = controller.step(history)
+        assert step.share == share
+        steps.append(step.q_target - first.q)
+        history.append(Touch(step.q_target, MISSED))
+    for share, x in zip(SHARES, steps, strict=True):
+        np.testing.assert_allclose(x, share * steps[0], atol=1e-14)
+    last = controller.step(history)
+    assert last.q_target is None and last.plan is None
+    assert last.reason == (
+        "3 misses from one grasp, the last: a finger closed without touching (finger_2)"
+    )
+
+
+def test_a_touch_after_misses_begins_anew(robot, stack, first):
+    controller = Controller(robot, stack)
+    history = [Touch(first.q, MISSED), Touch(first.q, MISSED), Touch(first.q, first)]
+    assert controller.step(history).share == 1.0
+
+
+def test_a_spent_budget_ends_the_run(robot, stack, first):
+    controller = Controller(robot, stack, budget=2)
+    history = [Touch(first.q, first)]
+    assert controller.step(history).q_target is not None
+    spent = controller.step(history * 2)
+    assert spent.q_target is None and spent.reason == "the budget of 2 touches is spent"
+
+
+def test_misses_alone_are_no_ground_for_a_step(robot, stack, first):
+    step = Controller(robot, stack).step([Touch(first.q, MISSED)])
+    assert step.q_target is None and "begin where the hand touches" in step.reason
+
+
+def test_caps_stay_when_another_limit_is_named(robot, first):
+    """Only caps replace caps: adding a range must not let the arm go."""
+    history = [Touch(first.q, first)]
+    stack = stack_of("fmk")
+    plain = Controller(robot, stack).step(history)
+    ranged = Controller(robot, stack.within(ConfigurationLimit(robot))).step(history)
+    np.testing.assert_array_equal(plain.q_target, ranged.q_target)
+    wide = VelocityLimit(np.full(robot.n, 1.0), 2.0)
+    capped = Controller(robot, stack.within(wide)).stack.limits
+    assert [type(limit) for limit in capped] == [VelocityLimit, ConfigurationLimit]
+
+
+def test_one_law_is_a_stack_too(robot, first):
+    step = Controller(robot, ForceTask()).step([Touch(first.q, first)])
+    assert np.isfinite(step.q_target).all()
+
+
+@pytest.mark.parametrize(
+    ("history", "message"),
+    [
+        ([], "the history is empty"),
+        ([1], "a history holds Touch values; got 1"),
+        ([Touch(np.zeros(3), MISSED)], r"a touch has 3 joints, Robot\('wam_bhand'\) has 11"),
+    ],
+)
+def test_a_malformed_history_is_refused(robot, stack, history, message):
+    with pytest.raises(InputError, match=message):
+        Controller(robot, stack).step(history)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"form": "papr"}, "unknown form 'papr'; choose one of: hierarchy, clipped, paper"),
+        ({"budget": 0}, "at least 1 touch"),
+        ({"robot": "wam_bhand"}, "must be a Robot"),
+        ({"stack": "fmk"}, "'fmk' is no control law"),
+        ({"form": "paper", "stack": KinematicTask() >> ForceTask()}, "kinematic law last"),
+    ],
+)
+def test_malformed_settings_are_refused(robot, stack, arguments, message):
+    with pytest.raises(InputError, match=message):
+        Controller(**({"robot": robot, "stack": stack} | arguments))
+
+
+def test_a_touch_holds_finite_joints_and_what_was_felt(first):
+    with pytest.raises(InputError, match="must be finite"):
+        Touch(np.full(11, np.nan), MISSED)
+    with pytest.raises(InputError, match="must be a Grasp or a Missed"):
+        Touch(np.zeros(11), None)
+    with pytest.raises(InputError, match="has 3 joints, its grasp 11"):
+        Touch(np.zeros(3), first)
+
+
+def test_a_robots_grasp_is_the_one_that_its_probe_feels(robot, first):
+    felt = [Contact(c.position, c.normal, confidence=0.5) for c in first.contacts]
+    again = robot.grasp(first.q, felt)
+    for name in ("q", "jacobian", "hessian", "coupling", "offset", "positions", "normals"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    for one, other in zip(again.contacts, first.contacts, strict=True):
+        assert (one.name, one.body, one.flexion) == (other.name, other.body, other.flexion)
+        assert one.confidence == 0.5
+    with pytest.raises(InputError, match=r"touches with 3 points .*got 2 contacts"):
+        robot.grasp(first.q, felt[:2])
+
+
+def test_a_form_of_ones_own_stands_in_the_place_of_a_name(robot, first):
+    class Still:
+        def check(self, stack):
+            pass
+
+        def plan(self, stack, grasp):
+            plan = form_of("clipped").plan(stack, grasp)
+            return dataclasses.replace(plan, x=np.zeros(grasp.n))
+
+    step = Controller(robot, MomentTask(), form=Still()).step([Touch(first.q, first)])
+    np.testing.assert_allclose(step.q_target, first.q, atol=1e-12)
+
+
+def test_the_history_of_something_else_is_named(tmp_path):
+    path = tmp_path / "other.json"
+    path.write_text('{"a": 1}')
+    with pytest.raises(ResultsError, match="no history of touches"):
+        load_history(path)
