@@ -520,7 +520,7 @@ def _weigh(levels, work):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _column(k, levels, work):
+def _column(k, levels, rough, work):
     """Column k of lam (M, p + 1), the multipliers of the rows above for level k's optimality.
 
     A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; the one behind the last of the `levels` taken in, p in the
@@ -542,9 +542,10 @@ def _column(k, levels, work):
         return
     else:
         lo, hi = start[k], start[k + 1]
+        unasked = rough[k] * np.sqrt(_dot(work.wa, lo, work.wa, lo, hi - lo))
         for j in range(top):
             g[j] = 0.0
-            h[j] = 0.0
+            h[j] = unasked
         # The residuals of the rows that span the level follow from the others', to more digits
         # than the rows' values have: they balance them.
         r = 0 if work.turned[k] else first[k + 1] - top
@@ -667,7 +668,7 @@ def _broken(flat, lower, upper, act, x, start, end, work):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late, work):
+def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late, rough, work):
     """Mark the active rows that hold x back although a level would gain by letting go.
 
     Returns how many, and the worst of those that the first such level names (−1: none), or where it
@@ -681,7 +682,7 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
         wrong[i] = 2 if (act[i] == 1 or act[i] == -1) and not kept[i] else 0
     k = 0
     while k <= levels and not (single and worst >= 0):
-        _column(k, levels, work)
+        _column(k, levels, rough, work)
         scale = length
         if k < levels:
             scale = frobenius[k] * np.sqrt(_dot(w, off[k], w, off[k], off[k + 1] - off[k]))
@@ -710,7 +711,7 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
 
 
 @njit(cache=True, error_model="numpy")
-def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first, blocks, pivots):
+def search(A, lower, upper, off, act, frobenius, row_norm, rough, first, blocks, pivots):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     Begins with the first `first` levels and takes in the next where these are settled. At each:
@@ -726,15 +727,6 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first
     M, n = A.shape
     p = len(off) - 1
     work = _work(M, n, p)
-    rough = np.empty(p)
-    for k in range(p):
-        demanding = False  # a limit's rank is never cut
-        for i in range(off[k], off[k + 1]):
-            demanding |= act[i] == 2
-        if rank_tolerance < 0.0 or not demanding:
-            rough[k] = max(off[k + 1] - off[k], n) * EPS * frobenius[k]
-        else:
-            rough[k] = rank_tolerance * frobenius[k]
     only = _only_entries(A)
     flat = A.ravel()
     target, side, wrong = work.target, work.side, work.wrong
@@ -770,8 +762,9 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first
                     s += target[i] * target[i]
             if frobenius[k] > 0.0:
                 length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
-        for i in range(end):
-            work.slack[i] = FEASIBLE * row_norm[i] * length
+        for k in range(levels):
+            for i in range(off[k], off[k + 1]):
+                work.slack[i] = (FEASIBLE * row_norm[i] + rough[k]) * length
         broken, block, alpha = _broken(flat, lower, upper, act, x, start, end, work)
         unwilling = 0
         drop = -1
@@ -779,7 +772,7 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first
             late = 2 * (step - alone) > pivots  # Bland: the first one, so that it ends
             _complete(levels, o, work)
             unwilling, drop = _unwilling(
-                off, levels, act, frobenius, row_norm, length, kept, single, late, work
+                off, levels, act, frobenius, row_norm, length, kept, single, late, rough, work
             )
         count = broken + unwilling
         if count == 0:
@@ -827,5 +820,5 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rank_tolerance, first
         _complete(p, o, work)
         _weigh(p, work)
         for k in range(p + 1):
-            _column(k, p, work)
+            _column(k, p, rough, work)
     return x, work.lam, work.first[1:] - work.first[:-1]

@@ -30,28 +30,39 @@ LOST = 1e-2  # [–] and of the pull: what may be left
 
 
 @njit(cache=True, error_model="numpy")
-def measure(A, off):
-    """Row norms (M,) and the levels' Frobenius norms (p,)."""
+def measure(A, lower, upper, off, rank_tolerance):
+    """Row norms (M,), the levels' Frobenius norms (p,), and their rank floors (p,).
+
+    What a level asks for by less than its floor, rank tolerance × ‖A_k‖_F, nobody asks for. The
+    user's tolerance (< 0: none) holds for levels with equalities; limits keep the default.
+    """
     M, n = A.shape
     row_norm = np.empty(M)
     frobenius = np.empty(len(off) - 1)
+    floor = np.empty(len(off) - 1)
     for k in range(len(off) - 1):
         total = 0.0
+        asks = False
         for i in range(off[k], off[k + 1]):
+            asks |= lower[i] == upper[i]
             s = 0.0
             for j in range(n):
                 s += A[i, j] * A[i, j]
             row_norm[i] = np.sqrt(s)
             total += s
         frobenius[k] = np.sqrt(total)
-    return row_norm, frobenius
+        share = max(n, off[k + 1] - off[k]) * EPS
+        if asks and rank_tolerance >= 0.0:
+            share = rank_tolerance
+        floor[k] = share * frobenius[k]
+    return row_norm, frobenius, floor
 
 
 @njit(cache=True, error_model="numpy")
-def check(A, lower, upper, off, x, lam, tol, left, least_norm):
+def check(A, lower, upper, off, x, lam, tol, rank_tolerance, least_norm):
     """Residuals, and which columns of `lam` (M, p or p + 1) fail to prove their level optimal.
 
-    `left`: rank tolerance; a level may leave that part of its residual. With least_norm, column
+    A level may leave what is below its rank floor. With least_norm, column
     p must prove that x is the shortest optimum. Returns whether none fails; w (M,) with residuals
     of the size of rounding set to 0, and missed (p,), the levels with others; pull (M,) the
     residuals as they are, since a small one of a large row may balance the others; push (M,) 0
@@ -62,7 +73,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     M, n = A.shape
     p = len(off) - 1
     columns = p + 1 if least_norm else p
-    row_norm, frobenius = measure(A, off)
+    row_norm, frobenius, floor = measure(A, lower, upper, off, rank_tolerance)
     w = np.empty(M)
     pull = np.empty(M)  # w as it is: what counts as met may still balance the others
     nearest = np.empty(M)
@@ -89,8 +100,10 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     push = np.zeros(M, np.int8)
     own = np.empty(M, np.int64)
     missed = np.empty(p, np.bool_)
+    size = np.empty(p)
     for k in range(p):
         rest = 0.0
+        total = 0.0
         for i in range(off[k], off[k + 1]):
             own[i] = k
             unit = abs(nearest[i]) + row_norm[i] * length
@@ -98,7 +111,9 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
             value = nearest[i] + w[i]
             if abs(w[i]) <= room:
                 w[i] = 0.0
+            room += floor[k] * length
             rest += w[i] * w[i]
+            total += pull[i] * pull[i]
             up = value >= upper[i] - room
             down = value <= lower[i] + room
             if w[i] != 0.0 or lower[i] == upper[i] or (up and down):
@@ -111,8 +126,9 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                 for j in range(n):
                     scale[j, k] += abs(A[i, j]) * room
         missed[k] = rest > 0.0
+        size[k] = np.sqrt(total)
         for j in range(n):
-            scale[j, k] += left * frobenius[k] * np.sqrt(rest)
+            scale[j, k] += floor[k] * size[k]
     if least_norm:
         scale[:, p] = tol * length
     forces = np.zeros((M, columns))
@@ -123,6 +139,7 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
     proven = np.empty(columns, np.bool_)
     every = True
     imbalance = np.empty((n, columns))
+    unasked = np.zeros((n, columns))  # of it, what is below the level's rank floor
     terms = np.empty(n)  # sums of the sizes of what makes it up
     for k in range(columns):
         for _ in range(SIGN_PASSES):
@@ -140,6 +157,8 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
                             continue
                         for r in range(off[between + 1]):
                             forces[r, k] += t * forces[r, between]
+                        for j in range(n):
+                            unasked[j, k] += t * unasked[j, between]
                         mended = True
                         break
                 if t == 0.0:
@@ -147,23 +166,22 @@ def check(A, lower, upper, off, x, lam, tol, left, least_norm):
             if not mended:
                 break
         pulls = 0.0  # the level's own, to be balanced
-        dust = 0.0  # entries that small are below the rank of their level
-        if k < p:
-            dust = max(n, off[k + 1] - off[k]) * EPS * frobenius[k]
         for j in range(n):
             s = x[j] if k == p else 0.0
             terms[j] = 0.0
             for i in range(off[min(k, p)], off[min(k + 1, p)]):
                 s += A[i, j] * forces[i, k]
                 terms[j] += abs(A[i, j] * forces[i, k])
-                if abs(A[i, j]) <= dust:
-                    scale[j, k] += abs(A[i, j] * forces[i, k])
             imbalance[j, k] = s
             pulls = max(pulls, abs(s))
         for j in range(n):
             for i in range(off[min(k, p)]):
                 imbalance[j, k] += A[i, j] * forces[i, k]
                 terms[j] += abs(A[i, j] * forces[i, k])
+            imbalance[j, k] -= unasked[j, k]
+            if k < p:
+                most = n * floor[k] * size[k]
+                unasked[j, k] += max(-most, min(most, imbalance[j, k]))
         widest = 0.0  # a force's error reaches other unknowns too
         for j in range(n):
             widest = max(widest, terms[j])
@@ -184,7 +202,7 @@ def optimality_faults(
     x: np.ndarray,
     multipliers: np.ndarray,
     tol: float,
-    left: float = 0.0,
+    rank_tolerance: float = -1.0,
     least_norm: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
     """Residuals w (M,), levels that have some (p,), and what keeps x from being certified.
@@ -192,7 +210,7 @@ def optimality_faults(
     That is said for each level at fault, and for p where x is not shown to be the shortest.
     """
     every, w, missed, pull, push, proven, scale = check(
-        A, lower, upper, off, x, multipliers, tol, left, least_norm
+        A, lower, upper, off, x, multipliers, tol, rank_tolerance, least_norm
     )
     faults: dict[int, str] = {}
     if every:

@@ -91,7 +91,7 @@ class HQP:
         where no way leads to an answer that passes its certificate.
         """
         rows = stack(levels)
-        norms = measure(rows.A, rows.offsets)
+        norms = measure(rows.A, rows.lower, rows.upper, rows.offsets, -1.0 if self.rank_tolerance is None else self.rank_tolerance)
         equalities = active_set.equalities(rows.lower, rows.upper)
         tried = _Tried([], [])
         if self.shortcuts:
@@ -183,7 +183,7 @@ class HQP:
         self,
         levels: Sequence[Level],
         rows: Stacked,
-        norms: tuple[np.ndarray, np.ndarray],
+        norms: tuple[np.ndarray, np.ndarray, np.ndarray],
         act: np.ndarray,
         method: str,
         tried: _Tried,
@@ -191,7 +191,7 @@ class HQP:
         rounds: int,
     ) -> Solution | None:
         """Settle the active set and certify; None, with the reason in `tried`, where it fails."""
-        row_norm, frobenius = norms
+        row_norm, frobenius, floor = norms
         x, multipliers, rank = active_set.search(
             rows.A,
             rows.lower,
@@ -200,7 +200,7 @@ class HQP:
             act,
             frobenius,
             row_norm,
-            -1.0 if self.rank_tolerance is None else self.rank_tolerance,
+            floor,
             first,
             rounds,
             PIVOTS * sum(rows.A.shape),
@@ -219,7 +219,7 @@ class HQP:
         tried: _Tried,
     ) -> Solution | None:
         """The answer, where it passes its certificate; None, with the reason in `tried`."""
-        left = self.rank_tolerance or 0.0
+        left = -1.0 if self.rank_tolerance is None else self.rank_tolerance
         residual, missed, faults = optimality_faults(
             rows.A,
             rows.lower,
@@ -263,7 +263,7 @@ def _possible(act: np.ndarray, rows: Stacked) -> None:
     act[infinite] = 0
 
 
-def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray], backend: Backend) -> np.ndarray:
+def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray, np.ndarray], backend: Backend) -> np.ndarray:
     """Let a QP solver name the active rows, level by level in the freedom that is left.
 
     Equalities, rows that cannot be met and rows held by a strong dual are frozen for the levels
@@ -271,7 +271,7 @@ def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray], backend: Backe
     """
     A, n = rows.A, rows.A.shape[1]
     act = np.zeros(len(A), dtype=np.int8)
-    row_norm, frobenius = norms
+    row_norm, frobenius, floor = norms
     is_equal = rows.lower == rows.upper
     unit = np.where(row_norm > 0.0, row_norm, 1.0)
     x = np.zeros(n)

@@ -126,7 +126,7 @@ class Solution:
     # 0 where found with many digits: there the certificate finds its own
     method: str  # the way that found x
     failed: tuple[str, ...] = ()  # ways tried before whose answers failed the certificate
-    rank_tolerance: float = 0.0  # [–] the user's, 0 for the default rule
+    rank_tolerance: float = -1.0  # [–] the user's, < 0 for the default rule
 
     @property
     def limit_active(self) -> bool:
