@@ -9,14 +9,16 @@ import numpy as np
 
 from hqp_grasp.control.forms import Form, Plan, form_of
 from hqp_grasp.control.landing import land
-from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
+from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, StepLimit
 from hqp_grasp.errors import HqpGraspError, InputError
-from hqp_grasp.grasp import Grasp, Missed, Touch
+from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Priority, Stack, Task
 from hqp_grasp.world.robot import Robot
 
-SHARES = (1.0, 0.5, 0.25)  # of a step, tried in turn while it misses
+SHARES = (1.0, 0.5, 0.25)  # of a step, tried in turn while it finds nothing to touch
+RETREAT = 0.01  # [m] the palm withdraws by, for each time that a link was in the way
+MAX_RETREATS = 6
 CLIP_TOLERANCE = 1e-9  # [rad] a solver's rounding may leave a range by; more is a bug
 
 
@@ -45,12 +47,15 @@ class Controller:
 
     form="hierarchy" solves the joint-space hierarchy within its limits; "clipped" takes the strict
     projection of the same laws, scaled to the caps and clipped to the ranges; "paper" composes
-    gradients in contact space and maps them by the SR-inverse (eq. 11–13), then clips likewise.
-    A `Form` of one's own stands in the place of these names. A stack without caps gets
-    StepLimit(), one without ranges the robot's.
+    gradients in contact space and maps them by the SR-inverse (eq. 11–13), then clips likewise;
+    "paper-hierarchy" puts the paper's two levels strictly below the limits. A `Form` of one's own
+    stands in the place of these names. A stack without caps gets StepLimit(), one without ranges
+    the robot's.
 
-    After a miss the step from the last grasp is taken again, shorter: SHARES of it in turn. Then,
-    or once the `budget` of touches is spent, the controller gives up.
+    After a miss without touch the step from the last grasp is taken again, shorter: SHARES of it
+    in turn. Where another link than the fingertips met the object, the palm withdraws on the next
+    step, by RETREAT more at each such miss. Then, or once the `budget` of touches is spent, the
+    controller gives up.
     """
 
     robot: Robot
@@ -87,16 +92,20 @@ class Controller:
             return Step(None, reason="no touch has felt a grasp yet: begin where the hand touches")
         if self.budget is not None and len(history) >= self.budget:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
-        if len(misses) == len(SHARES):
+        blocked = sum(missed.reason is Miss.OTHER_LINK for missed in misses)
+        short = len(misses) - blocked
+        if short == len(SHARES) or blocked == MAX_RETREATS:
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
-        plan = self.form.plan(self.stack, grasp)  # type: ignore[union-attr,arg-type]
-        share = SHARES[len(misses)]
-        x = share * plan.x
+        stack: Stack = self.stack  # type: ignore[assignment]
+        if blocked:
+            stack = stack.within(RetreatLimit(self.robot, blocked * RETREAT))
+        plan = self.form.plan(stack, grasp)  # type: ignore[union-attr]
+        x = SHARES[short] * plan.x
         if self.landing:
-            x = land(self.robot, self.stack, grasp, x)  # type: ignore[arg-type]
-        return Step(self._clipped(grasp, x), (), plan, share)
+            x = land(self.robot, stack, grasp, x)
+        return Step(self._clipped(grasp, x), (), plan, SHARES[short])
 
     def _latest(self, history: Sequence[Touch]) -> tuple[Grasp | None, list[Missed]]:
         """The last grasp felt, and the misses since."""

@@ -1,4 +1,4 @@
-"""Three ways to plan one step from a grasp, behind one signature."""
+"""Ways to plan one step from a grasp, behind one signature."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hqp_grasp.control.paper import laws, paper_levels
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.hqp import HQP
-from hqp_grasp.hierarchy.level import Solution
+from hqp_grasp.hierarchy.level import Level, Solution
 from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.tasks import Priority, Stack
 
@@ -46,7 +46,12 @@ class Form(Protocol):
 
 @dataclass(frozen=True)
 class HierarchyForm:
-    """Limits and laws as one strict hierarchy in joint space, solved at once."""
+    """Limits and laws as one strict hierarchy in joint space, solved at once.
+
+    Where the step that the laws would take without limits is too long for the caps, all of them
+    ask for the same share of it. Caps alone would give the first law all that they allow, joint by
+    joint, and leave the others the rest: priorities would hold, and the step lose its direction.
+    """
 
     hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
 
@@ -54,16 +59,23 @@ class HierarchyForm:
         """Every stack has this form."""
 
     def plan(self, stack: Stack, grasp: Grasp) -> Plan:
-        laws = stack.law_levels(grasp)
-        levels = stack.limit_levels(grasp) + laws
-        begin = time.perf_counter()
-        solution = self.hqp.solve(levels)
-        solve_us = 1e6 * (time.perf_counter() - begin)
-        gap = None
-        if not solution.limit_active:
-            projected = Projection(rank_tolerance=self.hqp.rank_tolerance).solve(laws)
-            gap = float(np.abs(solution.x - projected.x).max())
-        return Plan(solution.x, solution, solution.limit_active, gap, solve_us)
+        return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
+
+
+@dataclass(frozen=True)
+class PaperHierarchyForm:
+    """The paper's own two levels, J q̇ = ẋ of eq. 11 ▷ q̇ = q̇_c of eq. 9, strictly below limits.
+
+    Without limits it is eq. 13 with λ → 0.
+    """
+
+    hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
+
+    def check(self, stack: Stack) -> None:
+        laws(stack)
+
+    def plan(self, stack: Stack, grasp: Grasp) -> Plan:
+        return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
 
 
 @dataclass(frozen=True)
@@ -96,15 +108,31 @@ class PaperForm:
         return _clipped(solution, stack, grasp, begin)
 
 
-FORMS = ("hierarchy", "clipped", "paper")
+FORMS = ("hierarchy", "paper-hierarchy", "clipped", "paper")
 
 
 def form_of(name: str, solver: str = "proxqp") -> Form:
-    """The form of that name, one of FORMS; `solver` is the hierarchy's."""
+    """The form of that name, one of FORMS; `solver` is that of the hierarchies."""
     one_of("form", name, FORMS)
+    hqp = HQP(solver, rank_tolerance=TOUCH_RANK)
     if name == "hierarchy":
-        return HierarchyForm(HQP(solver, rank_tolerance=TOUCH_RANK))
+        return HierarchyForm(hqp)
+    if name == "paper-hierarchy":
+        return PaperHierarchyForm(hqp)
     return ClippedForm() if name == "clipped" else PaperForm()
+
+
+def _hierarchy(hqp: HQP, stack: Stack, grasp: Grasp, levels: list[Level]) -> Plan:
+    """The step of `levels` below the limits, all asking for the share of it that fits the caps."""
+    begin = time.perf_counter()
+    unlimited = Projection(rank_tolerance=hqp.rank_tolerance).solve(levels).x
+    share = 1.0 / max(1.0, cap_ratio(unlimited, stack, grasp))
+    asked = [Level.equal(level.A, share * level.upper, level.name) for level in levels]
+    solution = hqp.solve(stack.limit_levels(grasp) + asked)
+    solve_us = 1e6 * (time.perf_counter() - begin)
+    limit_active = share < 1.0 or solution.limit_active
+    gap = None if limit_active else float(np.abs(solution.x - unlimited).max())
+    return Plan(solution.x, solution, limit_active, gap, solve_us)
 
 
 def _clipped(solution: Solution, stack: Stack, grasp: Grasp, begin: float) -> Plan:
@@ -114,11 +142,16 @@ def _clipped(solution: Solution, stack: Stack, grasp: Grasp, begin: float) -> Pl
 
 
 def clip_to_limits(x: np.ndarray, stack: Stack, grasp: Grasp) -> np.ndarray:
-    """What is done to a step that knows no limits: scaled to the caps, then clipped to the ranges.
+    """What is done to a step that knows no limits.
 
-    The scale keeps the step's direction, the clip does not keep its priorities.
+    It is scaled to the caps, moved the least way that keeps clear, and clipped to the ranges. The
+    scale keeps the step's direction; the others do not keep its priorities.
     """
     x = x / max(1.0, cap_ratio(x, stack, grasp))
+    for limit in stack.limits:
+        if limit.priority is Priority.CLEARANCE:
+            level = limit.level(grasp)
+            x = x - np.linalg.pinv(level.A) @ level.residual(x)
     for limit in stack.limits:
         if isinstance(limit, ConfigurationLimit):
             robot = limit.robot

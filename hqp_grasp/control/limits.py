@@ -1,4 +1,4 @@
-"""What a step may not do: caps on its length, and the joints' ranges."""
+"""What a step may not do: be too long, leave the joints' ranges, come too near."""
 
 from __future__ import annotations
 
@@ -81,3 +81,17 @@ class ConfigurationLimit(Limit):
             )
         A = grasp.coupling[limited]  # type: ignore[index]
         return Level(A, (lower - q)[limited], (upper - q)[limited], "range")
+
+
+@dataclass(frozen=True, eq=False)
+class RetreatLimit(Limit):
+    """The palm moves back along its approach axis by at least `distance` [m]."""
+
+    robot: Robot
+    distance: float  # [m]
+    priority = Priority.CLEARANCE
+
+    def level(self, grasp: Grasp) -> Level:
+        approach = self.robot.palm(grasp.q)[1][:, 2]
+        A = approach @ self.robot.palm_jacobian(grasp.q)[:3]
+        return Level(A[None], np.array([-np.inf]), np.array([-self.distance]), "retreat")

@@ -38,7 +38,7 @@ class Settings:
     """Processes."""
     out: Path | None = None
     """Results folder; a rerun continues it. Default: out/SCENARIO-STACK-FORM."""
-    form: Literal["hierarchy", "clipped", "paper"] = "hierarchy"
+    form: Literal["hierarchy", "paper-hierarchy", "clipped", "paper"] = "hierarchy"
     """hierarchy: strict priorities within limits. clipped: projection, then clipped to the limits.
     paper: gradients in contact space and SR-inverse (eq. 11-13), then clipped."""
     kinematic_error: Literal["angle", "eq7"] = "angle"
@@ -51,8 +51,9 @@ class Settings:
     """Longest step of a contact along an axis [m]."""
     landing: bool = True
     """Correct each step by the hand's own kinematics before it touches."""
-    links: Literal["pass", "block"] = "pass"
-    """Whether links other than the fingertips pass through the object, as in the paper."""
+    links: Literal["block", "pass"] = "block"
+    """Whether links other than the fingertips are stopped by the object, or pass through it, as in
+    the paper."""
 
 
 def main(name: str, scene: Scene, settings: Settings | None = None) -> None:

@@ -33,7 +33,7 @@ class Trial:
     probes: int = 60  # touches after the first
     form: str | Form = "hierarchy"
     landing: bool = True
-    links: str = "pass"  # or "block": see GeometricProbe
+    links: str = "block"  # or "pass": see GeometricProbe
     start: Start | Grasp = field(default_factory=Start)
 
     def __post_init__(self) -> None:

@@ -28,13 +28,15 @@ class GeometricProbe:
     The hand moves to q_target with its flexions opened by RETREAT; then each finger closes along
     its flexion to the first touch, to TOUCH or better. Closing overwrites the flexions.
 
-    As in the paper's simulation the object is felt with the fingertips only: other links pass
-    through it, and the grasp names them in `other_links`. With `links="block"` such a touch is a
-    Missed instead. Threads may share a probe: each works on data of its own.
+    Other links feel the object too: a touch with one of them in it is a Missed. In the paper's
+    simulation the object is felt with the fingertips only; with `links="pass"` the others pass
+    through it likewise, and the grasp names them in `other_links`.
+
+    Threads may share a probe: each works on data of its own.
     """
 
     scene: Scene
-    links: str = "pass"  # or "block"
+    links: str = "block"  # or "pass"
     _local: threading.local = field(init=False, repr=False)  # each thread's own MjData
     _tips: np.ndarray = field(init=False, repr=False)  # geom ids (k,)
     _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch

@@ -36,7 +36,7 @@ class World:
     def __init__(self, thing, around=6):
         self.scene = Scene(object=thing)
         self.robot = self.scene.articulated
-        self.probe = GeometricProbe(self.scene)
+        self.probe = GeometricProbe(self.scene, links="pass")
         self.data = mujoco.MjData(self.scene.model)
         self.flexion = [j for (j,) in self.robot.flexion]
         self.grasps, self.targets, self.missed = [], [], []
