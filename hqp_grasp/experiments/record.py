@@ -149,6 +149,12 @@ def _kind(column: str) -> pa.DataType:
     return pa.bool_() if meaning(column).startswith("bool") else pa.float64()
 
 
+def kind_and_message(error: Exception) -> str:
+    """What ended a trial, in one line: "SolverError: no method found an answer"."""
+    notes = getattr(error, "__notes__", [])
+    return " ".join(f"{type(error).__name__}: {'; '.join([str(error), *notes])}".split())
+
+
 def empty_row(robot: Robot, stack: Stack, solution: Solution | None = None) -> dict[str, object]:
     """Every column of a probe that felt nothing; `solution`, where a step led to it."""
     points, joints = robot.description.contact_points, robot.joints
@@ -203,13 +209,13 @@ def law_columns(stack: Stack, grasp: Grasp | None, solution: Solution | None) ->
     no level for a law ("paper" composes force and moment into one step), both are None.
     """
     levels = {level.name: level for level in solution.levels} if solution is not None else {}
+    errors = stack.errors(grasp) if grasp is not None else {}
     row: dict[str, object] = {}
     for tasks in stack.priorities:
         level = levels.get(" + ".join(task.name for task in tasks))
         for task in tasks:
-            row[f"error_{task.name}"] = (
-                None if grasp is None else float(np.linalg.norm(task.error(grasp)))
-            )
+            error = errors.get(task.name)
+            row[f"error_{task.name}"] = None if error is None else float(np.linalg.norm(error))
             row[f"status_{task.name}"] = None if level is None else level.status
             row[f"rank_{task.name}"] = None if level is None else level.rank
     return row
