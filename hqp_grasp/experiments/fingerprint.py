@@ -65,11 +65,11 @@ class Fingerprint:
         if isinstance(value, Path):
             return str(value)
         if isinstance(value, np.ndarray) and value.dtype != object:
-            return f"{value.dtype}{list(value.shape)} {_sha(np.ascontiguousarray(value))}"
+            return f"{value.dtype}{list(value.shape)} {_sha(value.tobytes())}"
         if isinstance(value, mujoco.MjModel):
             buffer = np.empty(mujoco.mj_sizeModel(value), np.uint8)
             mujoco.mj_saveModel(value, None, buffer)
-            return f"model {_sha(buffer)}"
+            return f"model {_sha(buffer.tobytes())}"
         if isinstance(value, type | FunctionType | BuiltinFunctionType):
             self._note_source(value, at)
             return f"{value.__module__}.{value.__qualname__}"
@@ -93,9 +93,10 @@ class Fingerprint:
         """What an object is made of."""
         if isinstance(value, Robot):
             # The description's file is compiled into the model, wherever it stands.
-            return {**vars(value.description), "xml": None, "model": value.model}
+            about = {k: v for k, v in vars(value.description).items() if k != "xml"}
+            return about | {"model": value.model}
         if isinstance(value, Scene):
-            return vars(Scene(value.robot, value.object, value.position)) | {
+            return {f.name: getattr(value, f.name) for f in fields(value)} | {
                 "robot": value.articulated
             }
         if isinstance(value, mink.Limit) and _owner(type(value)) == "mink":
@@ -103,12 +104,9 @@ class Fingerprint:
             return {k: v for k, v in vars(value).items() if not k.startswith("_")}
         if is_dataclass(value):
             made = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-            known = {f.name for f in fields(value)} | {
-                k
-                for cls in type(value).__mro__
-                for k, v in vars(cls).items()
-                if isinstance(v, cached_property)
-            }
+            known = {f.name for f in fields(value)}
+            for cls in inspect.getmro(type(value)):
+                known |= {k for k, v in vars(cls).items() if isinstance(v, cached_property)}
             return made | {
                 k: v for k, v in getattr(value, "__dict__", {}).items() if k not in known
             }
@@ -120,7 +118,8 @@ class Fingerprint:
 
     def _note_source(self, thing: type | FunctionType | BuiltinFunctionType, at: str) -> None:
         """Take down the files that define a class and its bases, or a function."""
-        for part in thing.__mro__ if isinstance(thing, type) else (thing,):
+        parts = list(thing.__mro__) if isinstance(thing, type) else [thing]
+        for part in parts:
             owner = _owner(part)
             if owner == "hqp_grasp" or owner in VERSIONS:
                 continue
@@ -171,7 +170,7 @@ def _found_by_name(thing: type | FunctionType | BuiltinFunctionType) -> bool:
     return found is thing
 
 
-def _sha(data: bytes | np.ndarray) -> str:
+def _sha(data: bytes) -> str:
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -69,20 +69,22 @@ class Study:
         parts = _claim(out, self.configuration())
         missing = [i for i in range(self.trials) if not _is_done(_part(parts, i))]
         bar = tqdm(total=self.trials, initial=self.trials - len(missing), unit="trial", ncols=80)
+        failed: TrialError | None = None
         with bar, closing(self._run_missing(missing, parts)) as running:
             for i, error in running:
                 bar.update()
                 if self.strict and error is not None:
+                    failed = TrialError(f"trial {i} of seed {self.seed} ended by {error}", i)
                     break
-            else:
-                error = None
         table = _merge(parts, out / "probes.parquet")
-        if self.strict and error is not None:
-            raise TrialError(f"trial {i} of seed {self.seed} ended by {error}", i)
+        if failed is not None:
+            raise failed
         numbers = table.column("trial").to_numpy()
         return table.filter(pa.array(numbers < self.trials))
 
-    def _run_missing(self, missing: list[int], parts: Path) -> Iterator[tuple[int, str | None]]:
+    def _run_missing(
+        self, missing: list[int], parts: Path
+    ) -> Generator[tuple[int, str | None], None, None]:
         """Run these; yield each one's number, and what ended it."""
         if self.jobs == 1 or len(missing) < 2:
             for i in missing:

@@ -91,7 +91,13 @@ class HQP:
         where no way leads to an answer that passes its certificate.
         """
         rows = stack(levels)
-        norms = measure(rows.A, rows.lower, rows.upper, rows.offsets, -1.0 if self.rank_tolerance is None else self.rank_tolerance)
+        norms = measure(
+            rows.A,
+            rows.lower,
+            rows.upper,
+            rows.offsets,
+            -1.0 if self.rank_tolerance is None else self.rank_tolerance,
+        )
         equalities = active_set.equalities(rows.lower, rows.upper)
         tried = _Tried([], [])
         if self.shortcuts:
@@ -263,7 +269,9 @@ def _possible(act: np.ndarray, rows: Stacked) -> None:
     act[infinite] = 0
 
 
-def _cascade(rows: Stacked, norms: tuple[np.ndarray, np.ndarray, np.ndarray], backend: Backend) -> np.ndarray:
+def _cascade(
+    rows: Stacked, norms: tuple[np.ndarray, np.ndarray, np.ndarray], backend: Backend
+) -> np.ndarray:
     """Let a QP solver name the active rows, level by level in the freedom that is left.
 
     Equalities, rows that cannot be met and rows held by a strong dual are frozen for the levels
