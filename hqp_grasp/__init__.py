@@ -12,6 +12,7 @@ from hqp_grasp.errors import (
     ResultsError,
     SingularTaskError,
     SolverError,
+    TrialError,
 )
 from hqp_grasp.experiments.record import Record
 from hqp_grasp.experiments.start import Start
@@ -88,6 +89,7 @@ __all__ = [
     "Task",
     "Touch",
     "Trial",
+    "TrialError",
     "VelocityLimit",
     "ik_levels",
     "load_history",

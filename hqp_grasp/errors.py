@@ -27,6 +27,14 @@ class ReachError(HqpGraspError, RuntimeError):
     """No starting posture touches the object: it is out of the hand's reach."""
 
 
+class TrialError(HqpGraspError, RuntimeError):
+    """A trial of a strict study, or every trial of a scenario, ended in an error."""
+
+    def __init__(self, message: str, trial: int) -> None:
+        super().__init__(message)
+        self.trial = trial  # the number of the (first) one
+
+
 class SingularTaskError(HqpGraspError, ArithmeticError):
     """A control law is undefined at this grasp, for a reason that the message names."""
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is ever needed
-import matplotlib.pyplot as plt
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 
@@ -19,12 +17,21 @@ FLOOR = 1e-16  # errors below are drawn here
 
 
 def convergence(table: pa.Table, title: str, path: Path) -> None:
+    """Draw `convergence_figure` into the file `path`, whole or not at all."""
+    part = path.with_suffix(".part.png")
+    convergence_figure(table, title).savefig(part, dpi=130)
+    part.replace(path)
+
+
+def convergence_figure(table: pa.Table, title: str) -> Figure:
     """The three errors over the probes, and where the hand began and ended (Figures 3 and 4)."""
     force, moment, angle, adduction, elevation = (
         _by_trial(table, name)
         for name in ("eps_f", "eps_m", "eps_k", "adduction_deg", "elevation_deg")
     )
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    FigureCanvasAgg(figure)  # a canvas of its own: no display, and nobody's backend is touched
+    left, middle, right = figure.subplots(1, 3)
     _spread(left, force, FORCE, r"$\varepsilon_f$ [N²]")
     _spread(left, 1e3 * np.sqrt(moment), MOMENT, r"$\sqrt{\varepsilon_m}$ [mm·N]")
     left.axhline(CONVERGED_FORCE, color=FORCE, ls=":", lw=1)
@@ -39,10 +46,7 @@ def convergence(table: pa.Table, title: str, path: Path) -> None:
     right.set(xlabel="adduction [°]", ylabel="elevation [°]", title="posture of the hand")
     right.legend()
     figure.suptitle(title)
-    part = path.with_suffix(".part.png")
-    figure.savefig(part, dpi=130)
-    plt.close(figure)
-    part.replace(path)
+    return figure
 
 
 def _by_trial(table: pa.Table, name: str) -> np.ndarray:

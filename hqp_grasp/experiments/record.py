@@ -53,6 +53,8 @@ CONTACT_COLUMNS = {
     **{f"n{axis}": f"{axis} of the object's outward unit normal, world" for axis in "xyz"},
 }
 JOINT_COLUMN = "rad: joint angle"
+# "good", and what keeps a trial from being so, the gravest first.
+VERDICTS = ("good", "error", "lost", "not balanced", "link inside", "violation")
 TEXTS = {"outcome", "other_links", "method", "error"}
 
 
@@ -149,6 +151,12 @@ def _kind(column: str) -> pa.DataType:
     return pa.bool_() if meaning(column).startswith("bool") else pa.float64()
 
 
+def kind_and_message(error: Exception) -> str:
+    """What ended a trial, in one line: "SolverError: no method found an answer"."""
+    notes = getattr(error, "__notes__", [])
+    return " ".join(f"{type(error).__name__}: {'; '.join([str(error), *notes])}".split())
+
+
 def empty_row(robot: Robot, stack: Stack, solution: Solution | None = None) -> dict[str, object]:
     """Every column of a probe that felt nothing; `solution`, where a step led to it."""
     points, joints = robot.description.contact_points, robot.joints
@@ -203,13 +211,42 @@ def law_columns(stack: Stack, grasp: Grasp | None, solution: Solution | None) ->
     no level for a law ("paper" composes force and moment into one step), both are None.
     """
     levels = {level.name: level for level in solution.levels} if solution is not None else {}
+    errors = stack.errors(grasp) if grasp is not None else {}
     row: dict[str, object] = {}
     for tasks in stack.priorities:
         level = levels.get(" + ".join(task.name for task in tasks))
         for task in tasks:
-            row[f"error_{task.name}"] = (
-                None if grasp is None else float(np.linalg.norm(task.error(grasp)))
-            )
+            error = errors.get(task.name)
+            row[f"error_{task.name}"] = None if error is None else float(np.linalg.norm(error))
             row[f"status_{task.name}"] = None if level is None else level.status
             row[f"rank_{task.name}"] = None if level is None else level.rank
     return row
+
+
+def verdicts(table: pa.Table) -> dict[int, str]:
+    """What became of each trial, one of VERDICTS.
+
+    Good: ε_f ≤ CONVERGED_FORCE and √ε_m ≤ CONVERGED_MOMENT (the true ones, where they differ from
+    what was felt) from some probe to the last, no link but the contact points in the object at any
+    probe from 1 on, no violation of a limit, no error.
+    """
+    names = ["trial", "probe", "in_contact", "other_links", "limit_violation", "error"]
+    eps = [f"{e}_true" if f"{e}_true" in table.column_names else e for e in ("eps_f", "eps_m")]
+    rows = table.select([*names, *eps]).sort_by([("trial", "ascending"), ("probe", "ascending")])
+    trials: dict[int, list[dict[str, Any]]] = {}
+    for row in rows.to_pylist():
+        trials.setdefault(row["trial"], []).append(row)
+    return {trial: _verdict(rows, *eps) for trial, rows in trials.items()}
+
+
+def _verdict(rows: list[dict[str, Any]], force: str, moment: str) -> str:
+    last = rows[-1]
+    if any(row["error"] for row in rows):
+        return "error"
+    if not last["in_contact"]:
+        return "lost"
+    if not (last[force] <= CONVERGED_FORCE and last[moment] <= CONVERGED_MOMENT**2):
+        return "not balanced"
+    if any(row["other_links"] for row in rows if row["probe"] > 0):
+        return "link inside"
+    return "violation" if any(row["limit_violation"] > 0.0 for row in rows) else "good"

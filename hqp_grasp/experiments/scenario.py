@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
-from dataclasses import dataclass, field
+from collections import Counter
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
@@ -13,13 +15,15 @@ import tyro
 
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
-from hqp_grasp.errors import HqpGraspError
+from hqp_grasp.errors import HqpGraspError, TrialError
 from hqp_grasp.experiments.plots import convergence
-from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
+from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT, VERDICTS, verdicts
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.tasks import stack_of
+from hqp_grasp.tasks import Stack, stack_of
 from hqp_grasp.world.scene import Scene
+
+ABOUT_THE_RUN = {"trials", "seed", "jobs", "out", "strict"}  # settings that no trial reads
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class Settings:
     """Processes."""
     out: Path | None = None
     """Results folder; a rerun continues it. Default: out/SCENARIO-STACK-FORM."""
+    strict: bool = False
+    """Stop at the first trial that ends in an error; else it is recorded and the others go on."""
     form: Literal["hierarchy", "paper-hierarchy", "clipped", "paper"] = "hierarchy"
     """hierarchy: strict priorities within limits. clipped: projection, then clipped to the limits.
     paper: gradients in contact space and SR-inverse (eq. 11-13), then clipped."""
@@ -74,13 +80,13 @@ def _about(name: str, scene: Scene) -> str:
     )
 
 
-def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
-    """Run, print the table, write DIR/probes.parquet and DIR/convergence.png."""
+def trial_of(scene: Scene, settings: Settings) -> Trial:
+    """The trial that the settings describe."""
     stack = stack_of(settings.stack, settings.kinematic_error)
     stack = stack.within(
         StepLimit(settings.joint_cap, settings.contact_cap), ConfigurationLimit(scene.articulated)
     )
-    trial = Trial(
+    return Trial(
         scene=scene,
         stack=stack,
         probes=settings.probes,
@@ -88,23 +94,64 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
         landing=settings.landing,
         links=settings.links,
     )
+
+
+def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
+    """Run, print the table, write DIR/probes.parquet and DIR/convergence.png.
+
+    Raises TrialError where every trial ends in an error, or, if strict, where one does.
+    """
+    trial = trial_of(scene, settings)
     out = settings.out or Path("out") / f"{name}-{settings.stack}-{settings.form}"
-    study = Study(trial, settings.trials, settings.seed, settings.jobs)
-    print(f"{name}: {stack.name}, {settings.trials} trials of {settings.probes} probes")
-    table = study.run(out)
+    study = Study(trial, settings.trials, settings.seed, settings.jobs, settings.strict)
+    about = f"{name}: {Stack.of(trial.stack).name}, {settings.trials} trials"
+    print(f"{about} of {settings.probes} probes")
+    try:
+        table = study.run(out)
+        errors = {
+            row["trial"]: row["error"] for row in table.select(["trial", "error"]).to_pylist()
+        }
+        failed = [i for i, error in errors.items() if error is not None]
+        if len(failed) == len(errors):
+            raise TrialError(
+                f"every trial ended in an error, trial {failed[0]} by {errors[failed[0]]}",
+                failed[0],
+            )
+    except TrialError as error:
+        command = replay_command(scene, settings, error.trial)
+        raise TrialError(f"{error}; replay it:\n{command}", error.trial) from error
     figure = out / "convergence.png"
-    convergence(table, f"{name}: {stack.name}, {settings.trials} trials", figure)
+    convergence(table, about, figure)
     print(summary(table))
+    if failed:
+        command = replay_command(scene, settings, failed[0])
+        print(f"\nreplay trial {failed[0]}, the first that ended in an error:\n{command}")
     print(f"\nresults  {out / 'probes.parquet'}\nfigure   {figure}")
     return table
 
 
+def replay_command(scene: Scene, settings: Settings, trial: int) -> str:
+    """A line for the shell that runs one trial alone, and shows the whole error."""
+    decisive = [f for f in fields(settings) if f.name not in ABOUT_THE_RUN]
+    chosen = {f.name: getattr(settings, f.name) for f in decisive}
+    changed = [f"{f.name}={chosen[f.name]!r}" for f in decisive if chosen[f.name] != f.default]
+    code = (
+        "from pathlib import *; from hqp_grasp import *; "
+        "from hqp_grasp.experiments.scenario import *; "
+        f"trial = trial_of({scene!r}, Settings({', '.join(changed)})); "
+        f"print(trial.run(({settings.seed}, {trial})))"
+    )
+    if '"' not in code:
+        code = code.replace("'", '"')  # so that the shell's quotes need no escaping
+    return shlex.join([sys.executable, "-c", code])
+
+
 def summary(table: pa.Table) -> str:
     """What came of the trials, for people."""
-    columns = {n: table.column(n).to_numpy() for n in table.column_names}
+    columns = {n: table.column(n).to_numpy(zero_copy_only=False) for n in table.column_names}
     trials = len(np.unique(columns["trial"]))
     shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
-    held = shaped["in_contact"][:, -1].astype(bool)
+    touched = shaped["in_contact"].astype(bool)
     force, moment = shaped["eps_f"].astype(float), 1e3 * np.sqrt(shaped["eps_m"].astype(float))
     good = (force <= CONVERGED_FORCE) & (moment <= 1e3 * CONVERGED_MOMENT)
     stays = np.flip(np.logical_and.accumulate(np.flip(good, axis=1), axis=1), axis=1)
@@ -120,7 +167,8 @@ def summary(table: pa.Table) -> str:
     )
     for label, values, form in rows:
         cells = []
-        for picked in (values[:, 0], values[held, -1]):
+        for at in (0, -1):
+            picked = values[touched[:, at], at]
             if not len(picked) or not np.isfinite(picked).all():
                 cells.append("–")
             elif "°" in label or "rad" in label:
@@ -133,7 +181,14 @@ def summary(table: pa.Table) -> str:
         f"\nconverged{converged.sum():6} of {trials}{after}: "
         f"ε_f ≤ {CONVERGED_FORCE:g} N², √ε_m ≤ {1e3 * CONVERGED_MOMENT:g} mm·N, kept to the end"
     )
-    lines.append(f"lost     {(~held).sum():6} of {trials}")
+    verdict = Counter(verdicts(table).values())
+    others = " · ".join(f"{kind} {verdict[kind]}" for kind in VERDICTS if kind != "good")
+    lines.append(f"good{verdict['good']:11} of {trials} in every respect")
+    lines.append(f"         {others}")
+    errors = [error for error in shaped["error"][:, 0] if error is not None]
+    if errors:
+        kinds = Counter(error.partition(":")[0] for error in errors).most_common()
+        lines.append(f"errors   {', '.join(f'{kind} {count}' for kind, count in kinds)}")
     steps = shaped["step_share"].astype(float)
     taken = np.isfinite(steps)
     active = shaped["limit_active"].astype(bool) & taken
@@ -145,7 +200,10 @@ def summary(table: pa.Table) -> str:
         lines.append(
             f"gap      QP − projection ≤ {np.nanmax(gap):.1e} rad, over {share:.0%} of steps"
         )
-    other = (shaped["other_links"] != "") & shaped["in_contact"].astype(bool)
+    methods = Counter(method for method in columns["method"] if method is not None)
+    shares = (f"{method} {n / methods.total():.1%}" for method, n in methods.most_common())
+    lines.append(f"methods  {', '.join(shares) or '–'} of the steps")
+    other = (shaped["other_links"] != "") & touched
     lines.append(
         f"links    another link is in the object in {other.mean():.1%} of the probes, "
         f"at the end of {other[:, -1].sum()} trials"

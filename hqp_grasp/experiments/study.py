@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -17,28 +16,39 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.errors import InputError, ResultsError, TrialError
+from hqp_grasp.experiments.fingerprint import Fingerprint, differences
 from hqp_grasp.experiments.record import Record
 from hqp_grasp.experiments.trial import Trial
 
-VERSIONS = ("hqp_grasp", "numpy", "mujoco", "proxsuite", "daqp", "mink")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+STUDY_COLUMNS = {
+    "trial": "number of the trial",
+    "seed": "trial i draws from SeedSequence([seed, i])",
+}
 
 
 @dataclass(frozen=True)
 class Study:
     """`trials` runs of one trial; trial i draws from SeedSequence([seed, i]).
 
-    DIR/parts/ holds one file a trial, written whole or not at all; they are merged into
-    DIR/probes.parquet. DIR/config.json says what was run: a folder is continued with the same
-    configuration and refused with another. Raises ResultsError, before any work, for a folder
-    that cannot be written or belongs to another configuration.
+    DIR/parts/ holds one file a trial, written whole or not at all; DIR/probes.parquet is all of
+    them. DIR/config.json says what was run: a folder is continued with the same configuration and
+    refused with another, or where parts of it cannot be compared (see Fingerprint). Raises
+    ResultsError, before any work, for a folder that cannot be written or continued.
+
+    A trial that ends in an error keeps its rows so far, and says why in its column `error`; a rerun
+    tries it again, and `trial.run((seed, i))` raises that error. With `strict` the study stops at
+    the first one: what is done is on disk, then TrialError is raised.
     """
 
     trial: Trial
     trials: int = 40
     seed: int = 0
     jobs: int = 1
+    strict: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("trials", 1), ("seed", 0), ("jobs", 1)):
@@ -47,58 +57,77 @@ class Study:
 
     def configuration(self) -> dict[str, object]:
         """What fixes every figure of the study, timings aside; the number of trials does not."""
-        return {
-            "trial": repr(self.trial),
-            "model": self.trial.scene.fingerprint(),
-            "seed": self.seed,
-            "versions": {package: version(package) for package in VERSIONS},
-        }
+        found = Fingerprint(self.trial)
+        return {"seed": self.seed, **found.parts, "unknown": found.unknown}
 
-    def run(self, out: Path) -> pa.Table:
-        """Run what is missing in `out`, merge, and return the table of all `trials`."""
+    def run(self, out: str | Path) -> pa.Table:
+        """Run what is missing or failed in `out`, and return the rows of these `trials`.
+
+        DIR/probes.parquet keeps further trials too, where the folder has them.
+        """
+        out = Path(out)
         parts = _claim(out, self.configuration())
-        missing = [i for i in range(self.trials) if not _part(parts, i).exists()]
+        missing = [i for i in range(self.trials) if not _is_done(_part(parts, i))]
         bar = tqdm(total=self.trials, initial=self.trials - len(missing), unit="trial", ncols=80)
-        with bar:
-            for _ in self._run_missing(missing, parts):
+        failed: TrialError | None = None
+        with bar, closing(self._run_missing(missing, parts)) as running:
+            for i, error in running:
                 bar.update()
-        table = pa.concat_tables([pq.read_table(_part(parts, i)) for i in range(self.trials)])
-        _write(table, out / "probes.parquet")
-        return table
+                if self.strict and error is not None:
+                    failed = TrialError(f"trial {i} of seed {self.seed} ended by {error}", i)
+                    break
+        table = _merge(parts, out / "probes.parquet")
+        if failed is not None:
+            raise failed
+        numbers = table.column("trial").to_numpy()
+        return table.filter(pa.array(numbers < self.trials))
 
-    def _run_missing(self, missing: list[int], parts: Path) -> Iterator[None]:
+    def _run_missing(
+        self, missing: list[int], parts: Path
+    ) -> Generator[tuple[int, str | None], None, None]:
+        """Run these; yield each one's number, and what ended it."""
         if self.jobs == 1 or len(missing) < 2:
             for i in missing:
-                _run_one(self.trial, self.seed, i, parts)
-                yield
+                yield i, _run_one(self.trial, self.seed, i, parts)
             return
         with (
             _one_blas_thread(),
             ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn")) as pool,
         ):
-            futures = [pool.submit(_run_one, self.trial, self.seed, i, parts) for i in missing]
+            futures = {pool.submit(_run_one, self.trial, self.seed, i, parts): i for i in missing}
             try:
                 for future in as_completed(futures):
-                    yield future.result()
+                    yield futures[future], future.result()
             except BaseException:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
 
 
-def _run_one(trial: Trial, seed: int, i: int, parts: Path) -> None:
-    _write(_table(trial.run((seed, i)), i, seed), _part(parts, i))
+def _run_one(trial: Trial, seed: int, i: int, parts: Path) -> str | None:
+    """Run trial i and write it down; return what ended it, if anything did."""
+    record = trial.attempt((seed, i))
+    _write(_table(record, i, seed), _part(parts, i))
+    return record.error
 
 
 def _table(record: Record, trial: int, seed: int) -> pa.Table:
     """The record's table, and which trial of the study it is."""
     table = record.to_table()
-    meanings = {
-        "trial": "number of the trial",
-        "seed": "trial i draws from SeedSequence([seed, i])",
-    }
     for at, (name, value) in enumerate({"trial": trial, "seed": seed}.items()):
-        field = pa.field(name, pa.int64(), metadata={"meaning": meanings[name]})
-        table = table.add_column(at, field, pa.array([value] * len(record.rows), pa.int64()))
+        about = pa.field(name, pa.int64(), metadata={"meaning": STUDY_COLUMNS[name]})
+        table = table.add_column(at, about, pa.array([value] * len(record.rows), pa.int64()))
+    return table
+
+
+def _is_done(part: Path) -> bool:
+    """True where the trial has run, and no error ended it."""
+    return part.exists() and pq.read_table(part, columns=["error"])["error"].null_count > 0
+
+
+def _merge(parts: Path, whole: Path) -> pa.Table:
+    """All trials of the folder, in order."""
+    table = pa.concat_tables([pq.read_table(part) for part in sorted(parts.glob("*.parquet"))])
+    _write(table, whole)
     return table
 
 
@@ -123,18 +152,32 @@ def _claim(out: Path, configuration: dict[str, object]) -> Path:
     except OSError as error:
         raise ResultsError(f"{out} cannot be written: {error.strerror or error}") from error
     config = out / "config.json"
-    text = json.dumps(configuration, indent=2) + "\n"
-    if not config.exists():
-        if any(parts.iterdir()):
-            raise ResultsError(f"{out} holds results without a config.json; take another folder")
+    if config.exists():
+        _compare(out, json.loads(config.read_text()), configuration)
+    elif any(parts.iterdir()):
+        raise ResultsError(f"{out} holds results without a config.json; take another folder")
+    else:
         fresh = config.with_suffix(f".{os.getpid()}.part")
-        fresh.write_text(text)
+        fresh.write_text(json.dumps(configuration, indent=2) + "\n")
         fresh.replace(config)
-    elif config.read_text() != text:
-        raise ResultsError(
-            f"{out} belongs to another configuration ({config}); take another --out, or remove it"
-        )
     return parts
+
+
+def _compare(out: Path, there: dict[str, object], here: dict[str, object]) -> None:
+    """Raise ResultsError unless `out` can be continued."""
+    way_out = "take another --out, or remove it"
+    found = list(differences(there, json.loads(json.dumps(here))))
+    if found:
+        more = f", and {len(found) - 3} more" if len(found) > 3 else ""
+        which = "; ".join(found[:3]) + more
+        raise ResultsError(f"{out} belongs to another configuration: {which}; {way_out}")
+    unknown = here["unknown"]
+    if unknown:
+        assert isinstance(unknown, list)
+        raise ResultsError(
+            f"{out} has results, and whether they are of this configuration cannot be told: "
+            f"{unknown[0]}; {way_out}"
+        )
 
 
 @contextmanager

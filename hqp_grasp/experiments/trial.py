@@ -11,7 +11,7 @@ import numpy as np
 from hqp_grasp.control.controller import Controller, Step
 from hqp_grasp.control.forms import Form
 from hqp_grasp.errors import InputError, one_of
-from hqp_grasp.experiments.record import Record, empty_row, felt_row
+from hqp_grasp.experiments.record import Record, empty_row, felt_row, kind_and_message
 from hqp_grasp.experiments.start import FirstTouch, Start
 from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.tasks import Stack, Task
@@ -86,7 +86,7 @@ class Trial:
             failure = error
         rows += [empty_row(robot, stack) for _ in range(self.probes + 1 - len(rows))]
         grasps = tuple(touch.felt for touch in history if isinstance(touch.felt, Grasp))
-        ended = None if failure is None else f"{type(failure).__name__}: {failure}"
+        ended = None if failure is None else kind_and_message(failure)
         record = Record(entropy, tuple(rows), grasps, rejected, robot.joints, ended)
         return record, failure
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import mink
@@ -46,8 +47,8 @@ class Task(ABC):
 
     def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
         """The equality rows (A, b) asked of x = Δq over one probe: jacobian·x = −gain·error."""
-        A = self.weight * self.jacobian(grasp)
-        b = (-self.weight * self.gain) * self.error(grasp)
+        A = self.weight * np.asarray(self.jacobian(grasp), dtype=float)
+        b = (-self.weight * self.gain) * np.asarray(self.error(grasp), dtype=float)
         return A, b
 
     def __rshift__(self, other: Task | Stack) -> Stack:
@@ -77,6 +78,13 @@ class Stack:
             raise InputError(
                 "Stack.priorities must be tuples of control laws, none of them empty; "
                 f"got {self.priorities!r}"
+            )
+        names = [task.name for task in self.tasks]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(
+                f"two laws of this stack are named {twice!r}, and records tell laws apart by name; "
+                "make one a subclass with a `name` of its own"
             )
 
     @classmethod
@@ -119,8 +127,12 @@ class Stack:
 
     @property
     def tasks(self) -> tuple[Task, ...]:
-        """Every law, in order."""
+        """All laws, the most important first."""
         return tuple(task for tasks in self.priorities for task in tasks)
+
+    def errors(self, grasp: Grasp) -> dict[str, np.ndarray]:
+        """Each law's error (r,), by the law's name."""
+        return {task.name: _error(task, grasp) for task in self.tasks}
 
     @property
     def name(self) -> str:
@@ -155,9 +167,34 @@ def _task(value: object) -> Task:
     return value
 
 
+def _error(task: Task, grasp: Grasp) -> np.ndarray:
+    with _named(task):
+        error = np.asarray(task.error(grasp), dtype=float)
+    if error.ndim != 1:
+        raise InputError(f"the law {task.name!r}: error must have shape (r,); got {error.shape}")
+    return error
+
+
 def _level(task: Task, grasp: Grasp) -> Level:
-    A, b = task.rows(grasp)
+    with _named(task):
+        A, b = map(np.asarray, task.rows(grasp))
+    if b.ndim != 1 or A.shape != (len(b), grasp.n):
+        rows = len(b) if b.ndim == 1 else "r"
+        raise InputError(
+            f"the law {task.name!r}: error must have shape ({rows},) and jacobian "
+            f"({rows}, {grasp.n}); got {b.shape} and {A.shape}"
+        )
     return Level.equal(A, b, task.name)
+
+
+@contextmanager
+def _named(task: Task) -> Iterator[None]:
+    """What a law raises says which law it was."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"raised by the law {task.name!r} ({type(task).__qualname__})")
+        raise
 
 
 def _joined(levels: Iterable[Level]) -> Level:

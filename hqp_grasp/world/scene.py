@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -148,13 +147,6 @@ class Scene:
         mujoco.mju_mulQuat(quaternion, turn, np.array(self.base[3:]))
         quaternion /= np.linalg.norm(quaternion)
         return replace(self, base=(*(R @ np.array(self.base[:3]) + p), *quaternion))
-
-    def fingerprint(self) -> str:
-        """SHA-256 of the compiled model: a robot's folder may change and keep its name."""
-        model = self.model
-        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-        mujoco.mj_saveModel(model, None, buffer)
-        return hashlib.sha256(buffer.tobytes()).hexdigest()
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.

@@ -176,7 +176,10 @@ def test_a_malformed_history_is_refused(robot, stack, history, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"form": "papr"}, "unknown form 'papr'; choose one of: hierarchy, clipped, paper"),
+        (
+            {"form": "papr"},
+            "unknown form 'papr'; choose one of: hierarchy, paper-hierarchy, clipped, paper",
+        ),
         ({"budget": 0}, "at least 1 touch"),
         ({"robot": "wam_bhand"}, "must be a Robot"),
         ({"stack": "fmk"}, "'fmk' is no control law"),

@@ -455,7 +455,7 @@ def test_with_a_joint_at_its_limit_throughout_only_the_hierarchy_converges(
     limited = narrowed_scene(tmp_path, scene, "wam_j1", "-2.6 2.6", (lower, 2.6))
     found = {}
     for form in ("hierarchy", "clipped"):
-        hand = Hand(GeometricProbe(limited), first=first)
+        hand = Hand(GeometricProbe(limited, links="pass"), first=first)
         found[form] = Trial(limited, stack, probes=PROBES, form=form).run(SEEDS[2], hand)
         assert set(found[form].column("limit_violation")) == {0.0}
     assert all(row["limit_active"] for row in found["hierarchy"].rows[1:])
