@@ -42,17 +42,19 @@ class KinematicTask(Task):
     form: str  # "rows" or "gradient"
 
     # Written by hand because the keyword is called error, and so is the method: the choice is
-    # stored as `kind`. After this the task is as frozen as any other.
+    # stored as `kind`, which dataclasses.replace hands back.
     def __init__(
         self,
-        error: str = "angle",
+        error: str | None = None,
         form: str = "rows",
         *,
         gain: float = 0.25,
         weight: float = 1.0,
+        kind: str = "angle",
     ) -> None:
         set_field = object.__setattr__
-        set_field(self, "kind", one_of("KinematicTask error", error, ["angle", "eq7"]))
+        chosen = kind if error is None else error
+        set_field(self, "kind", one_of("KinematicTask error", chosen, ["angle", "eq7"]))
         set_field(self, "form", one_of("KinematicTask form", form, ["rows", "gradient"]))
         set_field(self, "gain", gain)
         set_field(self, "weight", weight)

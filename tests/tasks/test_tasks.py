@@ -660,3 +660,10 @@ def test_a_new_law_needs_only_an_error_and_a_jacobian() -> None:
     assert task.name == "height"
     assert A.shape == (3, 9)
     np.testing.assert_array_equal(b, [0, 0, -0.5])
+
+
+def test_a_kinematic_task_is_replaced_field_by_field_as_any_dataclass_is():
+    task = KinematicTask(error="eq7", form="gradient", gain=0.5)
+    assert dataclasses.replace(task, gain=0.75) == KinematicTask("eq7", "gradient", gain=0.75)
+    assert dataclasses.replace(task, error="angle").kind == "angle"
+    assert dataclasses.replace(task, kind="angle") == KinematicTask(form="gradient", gain=0.5)
