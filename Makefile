@@ -13,15 +13,24 @@ MADE := $(VENV)/.made
 READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 READY_BENCH := $(VENV)/.ready-bench
+# The oldest dependencies that pyproject.toml admits, with the oldest Python where there is one, in an
+# environment of their own. It keeps the compiled solver too: two numbas would overwrite each other's.
+OLDEST := .venv-oldest
+READY_OLDEST := $(OLDEST)/.ready
+BOUNDS := $(PY) -c 'import tomllib; \
+  project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+  needed = project["dependencies"] + project["optional-dependencies"]["test"]; \
+  print(*("{}=={}".format(*each.split(">=")) for each in needed), sep="\n")'
 
 unexport PYTHONPATH PYTHONHOME
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint docs bench clean
+.PHONY: help demo test test-oldest lint docs bench mutants results clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run the cylinder scenario; table on screen, results in out/cylinder'
 	@echo 'make test    lint, check types, run the tests, build the docs strictly'
+	@echo 'make test-oldest   run the tests with the oldest dependencies admitted, in .venv-oldest'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make docs    build the site into site/'
 	@echo 'make bench   compare with peers, print ratios'
@@ -35,6 +44,9 @@ test: lint $(READY_DEV)
 	$(PY) -m pytest $(PYTEST_ARGS)
 	$(PY) -m mkdocs build --strict --quiet
 
+test-oldest: $(READY_OLDEST)
+	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest $(PYTEST_ARGS)
+
 lint: $(READY_DEV)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
@@ -47,7 +59,7 @@ bench: $(READY_BENCH)
 	@set -e; for file in benchmarks/*.py; do echo "$$file"; $(PY) "$$file"; done
 
 clean:
-	rm -rf .venv build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-oldest build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find hqp_grasp robots scenarios benchmarks tests -name __pycache__ -prune -exec rm -rf {} +
 
 $(READY): pyproject.toml $(MADE)
@@ -61,6 +73,15 @@ $(READY_DEV): pyproject.toml $(MADE)
 	@$(PIP) --editable '.[test,dev,docs]'
 	@$(COMPILE)
 	@touch $(READY) $@
+
+$(READY_OLDEST): pyproject.toml $(MADE)
+	@echo 'Installing hqp_grasp and the oldest of all that it needs into $(OLDEST) (once)'
+	@python=python3.11; $$python -c 'import ensurepip, venv' 2>/dev/null || python=$(PY); \
+	  $$python -m venv --clear $(OLDEST)
+	@$(BOUNDS) > $(OLDEST)/bounds.txt
+	@$(OLDEST)/bin/python -m pip install --quiet --no-input --disable-pip-version-check \
+	  --constraint $(OLDEST)/bounds.txt --editable '.[test]'
+	@touch $@
 
 $(READY_BENCH): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and its peers into $(VENV) (once)'
