@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "hqp_grasp"
 FLOORS = (
     ("errors",),
     ("grasp",),
-    ("hierarchy", "world"),
+    ("history", "hierarchy", "world"),
     ("tasks",),
     ("control", "touch"),
     ("experiments",),

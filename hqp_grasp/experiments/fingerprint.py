@@ -22,12 +22,11 @@ import mink
 import mujoco
 import numpy as np
 
-import hqp_grasp
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
 VERSIONS = ("numpy", "scipy", "numba", "mujoco", "mink", "proxsuite", "daqp", "qpsolvers")
-PACKAGE = Path(hqp_grasp.__file__).parent
+PACKAGE = Path(__file__).parents[1]
 STDLIB = Path(sysconfig.get_path("stdlib"))
 
 
