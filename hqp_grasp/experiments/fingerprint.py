@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copyreg
 import hashlib
 import importlib.util
 import inspect
@@ -110,10 +111,13 @@ class Fingerprint:
                 k: v for k, v in getattr(value, "__dict__", {}).items() if k not in known
             }
         try:
-            return {"made by": value.__reduce_ex__(4)}
+            made_by = value.__reduce_ex__(4)
         except TypeError:
             self.unknown.append(f"{at}: a {type(value).__qualname__} cannot be read")
             return {}
+        plain = made_by[:2] == (copyreg.__newobj__, (type(value),))  # type: ignore[attr-defined]
+        state = made_by[2] or {} if plain and not any(made_by[3:]) else None
+        return state if isinstance(state, dict) else {"made by": made_by}
 
     def _note_source(self, thing: type | FunctionType | BuiltinFunctionType, at: str) -> None:
         """Take down the files that define a class and its bases, or a function."""
