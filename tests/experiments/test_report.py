@@ -1,0 +1,127 @@
+"""Questions answered from results: shares with intervals, pairs, and the trials that failed."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import binomtest
+
+from hqp_grasp.errors import ResultsError
+from hqp_grasp.experiments.report import interval, outcomes, paired_difference, report
+
+BALANCED, OFF = (1e-4, 1e-6), (1e-2, 1e-6)  # ε_f [N²], ε_m [(N·m)²]
+LOST = (None, None)
+# Trials of four rows each, by the errors of their rows.
+TRIALS = {
+    "good from the start": [BALANCED] * 4,
+    "good from 2": [OFF, OFF, BALANCED, BALANCED],
+    "relapsed": [OFF, BALANCED, OFF, BALANCED],
+    "lost": [OFF, BALANCED, LOST, LOST],
+    "not balanced": [BALANCED, BALANCED, BALANCED, OFF],
+}
+
+
+def write(folder, trials, **columns):
+    """A results folder with these trials; `columns` overrule whole columns of one trial."""
+    rows = []
+    for number, errors in enumerate(trials):
+        for probe, (force, moment) in enumerate(errors):
+            touched = force is not None
+            rows.append(
+                {
+                    "trial": number,
+                    "seed": 5,
+                    "probe": probe,
+                    "eps_f": force,
+                    "eps_m": moment,
+                    "in_contact": touched,
+                    "other_links": "",
+                    "limit_violation": 0.0,
+                    "error": None,
+                    "adduction_deg": 50.0 + number if touched else None,
+                    "outcome": "touch" if touched else "missed",
+                    "method": "proxqp",
+                }
+            )
+    for name, (number, values) in columns.items():
+        for row, value in zip((r for r in rows if r["trial"] == number), values, strict=True):
+            row[name] = value
+    folder.mkdir()
+    schema = pa.Table.from_pylist(rows).schema
+    at = schema.get_field_index("error")
+    schema = schema.set(at, pa.field("error", pa.string()))
+    # Rows in any order: a reader sorts.
+    rows = [rows[i] for i in np.random.default_rng(0).permutation(len(rows))]
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), folder / "probes.parquet")
+    return folder
+
+
+def test_each_trial_has_a_verdict_and_the_probe_from_which_it_stays_balanced(tmp_path):
+    found = outcomes(write(tmp_path / "a", TRIALS.values()))
+    assert [o.verdict for o in found] == ["good", "good", "good", "lost", "not balanced"]
+    assert [o.balanced_at for o in found] == [0, 2, 3, None, None]
+    assert [o.trial for o in found] == [0, 1, 2, 3, 4] and {o.seed for o in found} == {5}
+    assert found[3].adduction == 53.0  # of its last touch
+
+
+def test_links_violations_and_errors_are_kinds_of_their_own(tmp_path):
+    trials = [[BALANCED] * 4] * 3
+    folder = write(
+        tmp_path / "a",
+        trials,
+        other_links=(0, ["", "palm", "", ""]),
+        limit_violation=(1, [0.0, 0.0, 1e-3, 0.0]),
+        error=(2, [None, None, None, "SolverError: why"]),
+    )
+    assert [o.verdict for o in outcomes(folder)] == ["link inside", "violation", "error"]
+
+
+def test_true_errors_decide_where_they_are_known(tmp_path):
+    folder = write(tmp_path / "a", [[BALANCED] * 2])
+    table = pq.read_table(folder / "probes.parquet")
+    for name, value in (("eps_f_true", 1.0), ("eps_m_true", 0.0)):
+        table = table.append_column(name, pa.array([value] * len(table)))
+    pq.write_table(table, folder / "probes.parquet")
+    assert outcomes(folder)[0].verdict == "not balanced"
+
+
+@pytest.mark.parametrize(("count", "total"), [(0, 10), (10, 10), (878, 1000), (1, 3)])
+def test_intervals_of_a_share_are_wilsons(count, total):
+    known = binomtest(count, total).proportion_ci(0.95, method="wilson")
+    np.testing.assert_allclose(interval(count, total), (known.low, known.high), atol=2e-5)
+
+
+def test_the_interval_of_a_paired_difference_covers_it_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(400):
+        one = rng.random(200) < 0.9
+        other = np.where(rng.random(200) < 0.8, one, rng.random(200) < 0.7)
+        truth = (0.8 * 0.9 + 0.2 * 0.7) - 0.9
+        difference, low, high = paired_difference(one.tolist(), other.tolist())
+        assert difference == pytest.approx(other.mean() - one.mean())
+        covered += low <= truth <= high
+    assert 0.92 <= covered / 400 <= 0.98
+
+
+def test_a_report_counts_pairs_and_names_who_failed(tmp_path):
+    one = write(tmp_path / "one", TRIALS.values())
+    other = write(tmp_path / "other", [[BALANCED] * 4] * 5)
+    said = report([one, other])
+    assert f"{one}" in said and "3 [" in said and "5 [" in said
+    assert f"{other} against {one}, 5 pairs: good +40.0%" in said
+    assert f"lost: trial 3 of seed 5: python -m hqp_grasp view {one} --trial 3" in said
+    assert "2 (2.98, 3)" in said  # probes to balance
+
+
+@pytest.mark.parametrize(
+    ("prepare", "message"),
+    [
+        (lambda path: path.mkdir(), "it is no results folder"),
+        (lambda path: (path.mkdir(), (path / "probes.parquet").write_bytes(b"PAR1")), "is broken"),
+    ],
+)
+def test_a_folder_without_results_is_named(tmp_path, prepare, message):
+    prepare(tmp_path / "a")
+    with pytest.raises(ResultsError, match=message):
+        outcomes(tmp_path / "a")
