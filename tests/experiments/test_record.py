@@ -23,7 +23,7 @@ from hqp_grasp.experiments.record import (
     verdicts,
 )
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Miss, Missed
+from hqp_grasp.grasp import Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import ContactTask, ForceTask, KinematicTask, MomentTask, Stack
 from hqp_grasp.world.scene import Scene
@@ -74,7 +74,7 @@ def test_status_and_rank_of_a_law_are_those_of_its_level_in_the_step_that_led_th
     controller = trial.controller(trial.scene, 0)
     assert all(record.rows[0][f"{c}_{n}"] is None for c in ("status", "rank") for n in ("force",))
     for row, grasp in zip(record.rows[1:], record.grasps, strict=False):
-        solution = HQP(rank_tolerance=1e-6).solve(controller.stack.levels(grasp))
+        solution = controller.step([Touch(grasp.q, grasp)]).solution
         force, both, height = solution.levels[-3:]
         assert (row["status_force"], row["rank_force"]) == (force.status, force.rank)
         for name in ("moment", "kinematic"):  # they share a level
@@ -108,6 +108,12 @@ def test_a_probe_that_missed_says_how_the_laws_fared_in_its_step(scene, record):
     missed = Trial(scene, ForceTask(), probes=1, start=start).run(0, Nothing()).rows[1]
     assert missed["status_force"] in ("met", "nearest") and missed["rank_force"] in (1, 2, 3)
     assert missed["error_force"] is None and missed["contact_1_x"] is None
+
+
+def test_what_is_missing_in_a_column_is_nan_or_none(record):
+    status, rank = record.column("status_force"), record.column("rank_force")
+    assert status[0] is None and isinstance(status[1], str)
+    assert np.isnan(rank[0]) and rank[1] in (1.0, 2.0, 3.0)
 
 
 # ---------------------------------------------------------------- contacts and joints
