@@ -105,6 +105,13 @@ class Record:
         last = int(np.flatnonzero(bad)[-1]) if bad.any() else -1
         return None if last == len(bad) - 1 else last + 1
 
+    @property
+    def verdict(self) -> str:
+        """What became of the trial, one of VERDICTS; see `verdicts`."""
+        rows = [row | {"probe": i, "error": self.error} for i, row in enumerate(self.rows)]
+        eps = (f"{e}_true" if f"{e}_true" in self.rows[0] else e for e in ("eps_f", "eps_m"))
+        return _verdict(rows, *eps)
+
     def to_table(self) -> pa.Table:
         """One row a probe; unit and meaning of a column stand in its field's metadata."""
         count = len(self.rows)
