@@ -21,12 +21,25 @@ class HeightTask(ContactSpaceTask):
         return along_z - along_z.mean(axis=0)
 
 
+def blas_threads():
+    return os.environ.get("OPENBLAS_NUM_THREADS")
+
+
 @dataclass(frozen=True)
 class OneThreadTask(ForceTask):
     """The force law, in processes with one BLAS thread only."""
 
     def error(self, grasp):
-        threads = os.environ.get("OPENBLAS_NUM_THREADS")
-        if threads != "1":
-            raise RuntimeError(f"{threads} BLAS threads")
+        if blas_threads() != "1":
+            raise RuntimeError(f"{blas_threads()} BLAS threads")
+        return super().error(grasp)
+
+
+@dataclass(frozen=True)
+class ManyThreadsTask(ForceTask):
+    """The force law, never in a worker of a study."""
+
+    def error(self, grasp):
+        if blas_threads() == "1":
+            raise RuntimeError("1 BLAS threads")
         return super().error(grasp)

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from hqp_grasp.experiments.record import COLUMNS, CONTACT_COLUMNS, LAW_COLUMNS, TRIAL_COLUMNS
+from hqp_grasp.experiments.study import STUDY_COLUMNS
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 # A block of Python, and the block of text that stands right below it where there is one.
@@ -29,3 +32,20 @@ def test_examples_run_and_print_what_the_page_shows(page, tmp_path, monkeypatch)
             exec(compile(code, page, "exec"), names)
         if shown:
             assert printed.getvalue() == shown
+
+
+def test_the_quickstart_lists_every_column_of_the_results_in_their_order():
+    page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^\| column \|.*?(?=\n\n)", page, re.DOTALL | re.MULTILINE)
+    listed = [
+        name for row in table.splitlines() for name in re.findall(r"`(\S+)`", row.split("|")[1])
+    ]
+    assert listed == [
+        *STUDY_COLUMNS,
+        "probe",
+        *TRIAL_COLUMNS,
+        *COLUMNS,
+        *(f"{name}_{{law}}" for name in LAW_COLUMNS),
+        *(f"contact_{{i}}_{name}" for name in CONTACT_COLUMNS),
+        "q_{joint}",
+    ]

@@ -85,9 +85,11 @@ class Record:
         return f"<Record of seed {self.seed}: {len(self.rows)} rows, {end}>"
 
     def column(self, name: str) -> np.ndarray:
-        """One column over the probes; NaN where a number is missing."""
+        """One column over the probes; NaN where a number is missing, None where a text is."""
         one_of("column", name, self.rows[0])
         values = [row[name] for row in self.rows]
+        if _kind(name) == pa.string():
+            return np.array(values, dtype=object)
         return np.array([np.nan if value is None else value for value in values])
 
     @property

@@ -110,6 +110,12 @@ def test_a_probe_that_missed_says_how_the_laws_fared_in_its_step(scene, record):
     assert missed["error_force"] is None and missed["contact_1_x"] is None
 
 
+def test_what_is_missing_in_a_column_is_nan_or_none(record):
+    status, rank = record.column("status_force"), record.column("rank_force")
+    assert status[0] is None and isinstance(status[1], str)
+    assert np.isnan(rank[0]) and rank[1] in (1.0, 2.0, 3.0)
+
+
 # ---------------------------------------------------------------- contacts and joints
 
 

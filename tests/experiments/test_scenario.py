@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +12,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hqp_grasp.control.controller import Controller
+from hqp_grasp.errors import ReachError, SolverError
 from hqp_grasp.experiments import start
-from hqp_grasp.experiments.plots import convergence
-from hqp_grasp.experiments.scenario import summary
+from hqp_grasp.experiments.plots import FLOOR, convergence, convergence_figure
+from hqp_grasp.experiments.scenario import Settings, replay_command, summary, trial_of
 from hqp_grasp.experiments.study import Study
+from hqp_grasp.world.scene import Prism, Scene
 
 CYLINDER = Path(__file__).parents[2] / "scenarios" / "cylinder.py"
+ROBOT = Path(__file__).parents[2] / "robots" / "wam_bhand"
 TRIALS, PROBES = 2, 6
 TINY = ["--stack", "fmk", "--trials", str(TRIALS), "--probes", str(PROBES), "--jobs", "1"]
 
@@ -92,6 +97,26 @@ def first_for_good(rows):
     return first
 
 
+def judged(table):
+    """The contract's count of good trials and of the others' kinds, written anew."""
+    column = {name: np.array(table.column(name).to_pylist()) for name in table.column_names}
+    force, moment = column["eps_f"].astype(float), column["eps_m"].astype(float)
+    count = dict.fromkeys(("good", "error", "lost", "not balanced", "link inside", "violation"), 0)
+    for trial in np.unique(column["trial"]):
+        at = np.flatnonzero(column["trial"] == trial)
+        at = at[np.argsort(column["probe"][at])]
+        fine = (force[at] <= 1e-3) & (moment[at] <= 4e-6)
+        faults = {
+            "error": (column["error"][at] != None).any(),  # noqa: E711
+            "lost": not column["in_contact"][at[-1]],
+            "not balanced": not fine[-1],
+            "link inside": (column["other_links"][at[1:]] != "").any(),
+            "violation": (column["limit_violation"][at].astype(float) > 0.0).any(),
+        }
+        count[next((kind for kind, so in faults.items() if so), "good")] += 1
+    return count
+
+
 def check(table):
     """Every number of the summary, from the rows one by one."""
     text, rows = summary(table), table.to_pylist()
@@ -105,7 +130,13 @@ def check(table):
     if firsts:
         assert float(found(text, r"after ([\d.]+) probes")) == np.median(firsts)
         assert int(found(text, r"\(worst (\d+)\)")) == max(firsts)
-    assert int(found(text, r"lost +(\d+) of")) == len(trials) - len(held)
+    kinds = judged(table)
+    assert int(found(text, rf"good +(\d+) of {len(trials)} in every respect")) == kinds.pop("good")
+    assert " · ".join(f"{kind} {count}" for kind, count in kinds.items()) in text
+    methods = [row["method"] for row in rows if row["method"] is not None]
+    for method in set(methods):
+        share = 100 * methods.count(method) / len(methods)
+        assert float(found(text, rf"methods.*{method} ([\d.]+)%")) == pytest.approx(share, abs=0.06)
     steps = [row for row in rows if row["step_share"] is not None]
     active = sum(row["limit_active"] for row in steps) / len(steps)
     assert int(found(text, r"active in (\d+)% of the steps")) == round(100 * active)
@@ -147,9 +178,112 @@ def test_the_summarys_numbers_are_those_of_the_rows(ran):
 def test_a_lost_trial_is_counted_and_drawn(ran, tmp_path):
     table = with_a_lost_trial(pq.read_table(ran[0] / "probes.parquet"))
     check(table)
-    assert "lost          1 of 2" in summary(table)
+    assert "good          1 of 2 in every respect\n         error 0 · lost 1 · " in summary(table)
     convergence(table, "one lost", tmp_path / "figure.png")
     assert (tmp_path / "figure.png").is_file()
+
+
+def spoilt(table, trial, probe, **values):
+    """The same rows, one with other values."""
+    rows = table.to_pylist()
+    rows[trial * (PROBES + 1) + probe] |= values
+    return pa.Table.from_pylist(rows, schema=table.schema)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("violation", {"limit_violation": 1e-3}),
+        ("link inside", {"other_links": "palm"}),
+        ("not balanced", {"eps_f": 0.5, "other_links": "palm"}),
+        ("not balanced", {"eps_m": 4.1e-6}),
+        ("lost", {"in_contact": False, "eps_f": None, "eps_m": None, "limit_violation": 1.0}),
+        ("error", {"in_contact": False, "eps_f": None, "eps_m": None, "error": "SolverError: x"}),
+    ],
+)
+def test_each_kind_of_failure_is_counted_once_by_the_gravest_fault(ran, kind, values):
+    table = spoilt(pq.read_table(ran[0] / "probes.parquet"), 1, PROBES, **values)
+    assert judged(table) == {**dict.fromkeys(judged(table), 0), "good": 1, kind: 1}
+    check(table)
+
+
+def test_a_relapse_starts_the_count_of_probes_anew(ran):
+    table = pq.read_table(ran[0] / "probes.parquet")
+    before = first_for_good(table.to_pylist()[: PROBES + 1])
+    table = spoilt(table, 0, 0, eps_f=0.0, eps_m=0.0)
+    assert first_for_good(table.to_pylist()[: PROBES + 1]) == before > 1
+    check(table)
+
+
+def test_the_shares_of_the_methods_are_told_largest_first(ran):
+    table = pq.read_table(ran[0] / "probes.parquet")
+    table = spoilt(table, 0, 2, method="one row at a time")
+    assert re.search(r"methods  \S+ 91\.7%, one row at a time 8\.3% of the steps", summary(table))
+    check(table)
+
+
+# ---------------------------------------------------------------- the figure
+
+
+def drawn(axes):
+    """The lines on some axes, their x and y."""
+    return [(line.get_xdata(), line.get_ydata()) for line in axes.get_lines()]
+
+
+def test_every_error_is_drawn_on_its_own_axes(ran):
+    table = with_a_lost_trial(pq.read_table(ran[0] / "probes.parquet"))
+    by_trial = {
+        name: table.column(name).to_numpy().astype(float).reshape(TRIALS, -1)
+        for name in ("eps_f", "eps_m", "eps_k", "adduction_deg", "elevation_deg")
+    }
+    left, middle, right = convergence_figure(table, "three panels").axes
+    for axes, which, values in (
+        (left, 0, by_trial["eps_f"]),
+        (left, 1, 1e3 * np.sqrt(by_trial["eps_m"])),
+        (middle, 0, by_trial["eps_k"]),
+    ):
+        probes, median = drawn(axes)[which]
+        np.testing.assert_array_equal(probes, np.arange(PROBES + 1))
+        np.testing.assert_allclose(median, np.maximum(np.nanmedian(values, axis=0), FLOOR))
+    (start, end) = drawn(right)
+    last = PROBES - 3  # of the lost trial
+    for (x, y), at in ((start, [0, 0]), (end, [PROBES, last])):
+        np.testing.assert_array_equal(x, by_trial["adduction_deg"][range(TRIALS), at])
+        np.testing.assert_array_equal(y, by_trial["elevation_deg"][range(TRIALS), at])
+
+
+def test_every_axis_says_what_it_shows_and_in_which_unit(ran):
+    figure = convergence_figure(pq.read_table(ran[0] / "probes.parquet"), "three panels")
+    left, middle, right = figure.axes
+    assert figure.get_suptitle() == "three panels"
+    assert [text.get_text() for text in left.get_legend().get_texts()] == [
+        r"$\varepsilon_f$ [N²]",
+        r"$\sqrt{\varepsilon_m}$ [mm·N]",
+    ]
+    assert left.get_xlabel() == middle.get_xlabel() == "probe" and left.get_yscale() == "log"
+    assert middle.get_ylabel() == r"$\varepsilon_k$ [rad]" and middle.get_ylim()[0] == 0.0
+    assert (right.get_xlabel(), right.get_ylabel()) == ("adduction [°]", "elevation [°]")
+    assert [text.get_text() for text in right.get_legend().get_texts()] == ["start", "end"]
+
+
+def test_the_band_around_the_median_spans_all_trials(ran):
+    table = pq.read_table(ran[0] / "probes.parquet")
+    angle = table.column("eps_k").to_numpy().reshape(TRIALS, -1)
+    _, middle, _ = convergence_figure(table, "").axes
+    (corners,) = (path.vertices for path in middle.collections[0].get_paths())
+    for probe in range(PROBES + 1):
+        at = corners[corners[:, 0] == probe, 1]
+        assert (at.min(), at.max()) == (angle[:, probe].min(), angle[:, probe].max())
+
+
+def test_importing_the_scenarios_leaves_matplotlibs_backend_to_its_user():
+    code = (
+        "import matplotlib; matplotlib.use('svg');"
+        "import hqp_grasp, hqp_grasp.experiments.scenario, sys;"
+        "assert matplotlib.get_backend() == 'svg';"
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_with_every_trial_lost_there_still_is_a_summary_and_a_figure(ran, tmp_path):
@@ -239,10 +373,82 @@ def test_a_folder_of_other_settings_is_said_in_one_line(ran):
         call(*TINY, "--out", ran[0], "--seed", "5")
 
 
-def test_an_object_out_of_reach_is_said_in_one_line(monkeypatch, tmp_path):
+# ---------------------------------------------------------------- failing trials
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Trial 1 ends in a SolverError at its first step."""
+    step = Controller.step
+
+    def raising(self, history):
+        if self.seed == 1:
+            raise SolverError("no method found an answer")
+        return step(self, history)
+
+    monkeypatch.setattr(Controller, "step", raising)
+
+
+def replayed(said):
+    """Run the one command in `said` here, in this process."""
+    (line,) = (line for line in said.splitlines() if line.startswith(sys.executable))
+    python, option, code = shlex.split(line)
+    assert (python, option) == (sys.executable, "-c")
+    exec(code, {})
+
+
+def test_a_failing_trial_is_counted_by_kind_and_its_replay_is_one_line(failing, tmp_path, capsys):
+    call(*TINY, "--out", tmp_path, "--joint-cap", "0.3", "--seed", "4")
+    said = capsys.readouterr().out
+    assert "good          1 of 2 in every respect\n         error 1 · lost 0 · " in said
+    assert "errors   SolverError 1\n" in said
+    assert "replay trial 1, the first that ended in an error:" in said
+    assert (tmp_path / "convergence.png").is_file()
+    check(pq.read_table(tmp_path / "probes.parquet"))
+    with pytest.raises(SolverError, match="no method found an answer"):
+        replayed(said)
+
+
+def test_the_replay_runs_exactly_that_trial(ran, capsys):
+    settings = Settings(
+        probes=2, joint_cap=0.2, stack="fm", trials=9, jobs=7, out=Path("x"), seed=3
+    )
+    scene = Scene(object=Prism.regular(6, 0.05))
+    replayed(replay_command(scene, settings, 5))
+    assert repr(trial_of(scene, settings).run((3, 5))) in capsys.readouterr().out
+    assert not any(
+        word in replay_command(scene, settings, 5) for word in ("jobs", "trials", "out=")
+    )
+
+
+def test_the_replay_is_a_command_that_the_shell_takes(failing, tmp_path):
+    command = replay_command(Scene(robot=ROBOT), Settings(probes=1), 0)
+    said = subprocess.run(command, shell=True, capture_output=True, text=True, check=True).stdout
+    assert said.startswith("<Record of seed (0, 0): 2 rows")
+
+
+def test_strict_stops_at_the_first_failing_trial_and_says_how_to_replay_it(failing, tmp_path):
+    message = r"^cylinder: trial 1 of seed 0 ended by SolverError: no .*; replay it:\n"
+    with pytest.raises(SystemExit, match=message) as exit_:
+        call(*TINY, "--out", tmp_path, "--strict")
+    assert pq.read_table(tmp_path / "probes.parquet").num_rows == 2 * (PROBES + 1)
+    with pytest.raises(SolverError):
+        replayed(exit_.value.code)
+
+
+def test_where_every_trial_fails_that_is_said_and_the_status_is_not_zero(monkeypatch, tmp_path):
     monkeypatch.setattr(start, "_reach", lambda *_: None)
-    with pytest.raises(SystemExit, match=r"^cylinder: wam_bhand touches the object .* from none"):
+    message = (
+        r"^cylinder: every trial ended in an error, trial 0 by ReachError: wam_bhand touches the "
+        r"object .* from none .*; replay it:\n"
+    )
+    with pytest.raises(SystemExit, match=message) as exit_:
         call(*TINY, "--out", tmp_path)
+    errors = pq.read_table(tmp_path / "probes.parquet").column("error")
+    assert errors.null_count == 0
+    assert not (tmp_path / "convergence.png").exists()
+    with pytest.raises(ReachError):
+        replayed(exit_.value.code)
 
 
 def test_an_interrupt_says_that_the_same_command_continues(monkeypatch, tmp_path):

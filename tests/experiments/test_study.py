@@ -2,18 +2,22 @@
 
 import dataclasses
 import json
+import os
 import re
 import shutil
 
 import pyarrow.parquet as pq
 import pytest
+from own_law import ManyThreadsTask, OneThreadTask
 
-from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.control.controller import Controller
+from hqp_grasp.errors import InputError, ResultsError, SolverError, TrialError
+from hqp_grasp.experiments import fingerprint
 from hqp_grasp.experiments import study as module
 from hqp_grasp.experiments.record import COLUMNS, empty_row
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.tasks import stack_of
+from hqp_grasp.tasks import ForceTask, stack_of
 from hqp_grasp.world.scene import Cylinder, Scene
 
 TRIALS, PROBES, SEED = 3, 3, 7
@@ -68,7 +72,7 @@ def ran(monkeypatch):
 
     def counted(trial, seed, i, parts):
         numbers.append(i)
-        run_one(trial, seed, i, parts)
+        return run_one(trial, seed, i, parts)
 
     monkeypatch.setattr(module, "_run_one", counted)
     return numbers
@@ -121,9 +125,12 @@ def test_one_file_a_trial_and_no_leftovers(done):
 def test_the_folder_says_what_was_run(done):
     config = json.loads((done[0] / "config.json").read_text())
     assert config["seed"] == SEED
-    assert {"hqp_grasp", "mujoco", "proxsuite"} <= set(config["versions"])
-    for part in ("wam_bhand", "Cylinder(radius=0.05", "ForceTask", f"probes={PROBES}"):
-        assert part in config["trial"]
+    assert {"numpy", "mujoco", "proxsuite", "python"} <= set(config["versions"])
+    trial = config["trial"]
+    assert trial["scene"]["robot"]["name"] == "wam_bhand" and trial["probes"] == PROBES
+    assert trial["scene"]["object"]["radius"] == 0.05
+    assert trial["stack"]["priorities"][0][0]["class"].endswith("ForceTask")
+    assert config["hqp_grasp"].startswith("sha256:") and config["unknown"] == []
 
 
 def test_a_lost_trial_has_null_errors_and_rows_to_the_end(trial):
@@ -170,10 +177,16 @@ def test_a_study_can_go_on_with_more_trials(done, study, folder, ran):
     assert table.num_rows == (TRIALS + 1) * (PROBES + 1)
 
 
-def test_fewer_trials_are_the_first_ones(done, study, folder, ran):
+def test_fewer_trials_are_the_first_ones_and_the_file_keeps_the_others(done, study, folder, ran):
     table = dataclasses.replace(study, trials=1).run(folder)
     assert ran == []
     assert table.equals(done[1].slice(0, PROBES + 1))
+    assert pq.read_table(folder / "probes.parquet").equals(done[1])
+
+
+def test_a_folder_may_be_named_by_a_text(done, study, folder, ran):
+    assert study.run(str(folder)).equals(done[1])
+    assert ran == []
 
 
 def test_a_file_half_written_by_a_killed_run_is_ignored(done, study, folder, ran):
@@ -190,7 +203,7 @@ def test_an_interrupted_study_keeps_its_complete_trials(monkeypatch, done, study
     def interrupted(trial, seed, i, parts):
         if i == 1:
             raise KeyboardInterrupt
-        run_one(trial, seed, i, parts)
+        return run_one(trial, seed, i, parts)
 
     monkeypatch.setattr(module, "_run_one", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -219,6 +232,95 @@ def test_an_interrupt_while_writing_leaves_no_broken_trial(monkeypatch, done, st
     assert same(study.run(folder), done[1])
 
 
+# ---------------------------------------------------------------- failing trials
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Trials that fail from here on, at their second step."""
+    numbers, step = set(), Controller.step
+
+    def raising(self, history):
+        if self.seed in numbers and len(history) == 2:
+            raise SolverError(f"no answer in trial {self.seed}")
+        return step(self, history)
+
+    monkeypatch.setattr(Controller, "step", raising)
+    return numbers
+
+
+def test_a_failing_trial_is_recorded_and_the_others_go_on(done, study, tmp_path, failing):
+    failing.add(1)
+    table = study.run(tmp_path / "results")
+    assert pq.read_table(tmp_path / "results" / "probes.parquet").equals(table)
+    rows = table.to_pylist()
+    assert table.num_rows == TRIALS * (PROBES + 1)
+    for row, whole in zip(rows, done[1].to_pylist(), strict=True):
+        if row["trial"] != 1:
+            assert row["error"] is None
+        else:
+            assert row["error"] == "SolverError: no answer in trial 1"
+        if row["trial"] != 1 or row["probe"] < 2:
+            assert row["q_wam_j1"] == whole["q_wam_j1"] and row["eps_f"] == whole["eps_f"]
+        else:
+            assert row["in_contact"] is False
+            told = {name for name, value in row.items() if value not in (None, False, 0.0, "")}
+            assert told <= {"trial", "seed", "probe", "rejected", "error"}
+
+
+def test_a_rerun_tries_failed_trials_again_and_no_others(done, study, tmp_path, failing, ran):
+    out = tmp_path / "results"
+    failing.update((0, 2))
+    study.run(out)
+    failing.clear()
+    ran.clear()
+    assert same(study.run(out), done[1])
+    assert ran == [0, 2]
+    ran.clear()
+    study.run(out)
+    assert ran == []
+
+
+def test_run_of_the_same_seed_raises_what_ended_a_trial(study, failing):
+    failing.add(1)
+    with pytest.raises(SolverError, match="no answer in trial 1"):
+        study.trial.run((SEED, 1))
+
+
+def test_a_strict_study_stops_at_the_first_failure_with_the_rest_on_disk(
+    done, study, tmp_path, failing, ran
+):
+    out = tmp_path / "results"
+    failing.update((1, 2))
+    strict = dataclasses.replace(study, strict=True)
+    with pytest.raises(TrialError, match=f"trial 1 of seed {SEED} ended by SolverError") as caught:
+        strict.run(out)
+    assert caught.value.trial == 1
+    assert ran == [0, 1]
+    assert pq.read_table(out / "probes.parquet").num_rows == 2 * (PROBES + 1)
+    failing.clear()
+    assert same(strict.run(out), done[1])
+
+
+def test_a_strict_study_stops_in_several_processes_too(trial, tmp_path):
+    """The law refuses the one BLAS thread that every worker has."""
+    broken = dataclasses.replace(trial, stack=ManyThreadsTask())
+    study = Study(broken, 8, SEED, jobs=2, strict=True)
+    with pytest.raises(TrialError, match="1 BLAS threads; raised by the law 'manythreads'"):
+        study.run(tmp_path / "results")
+    errors = pq.read_table(tmp_path / "results" / "probes.parquet").column("error")
+    assert errors.null_count == 0 and len(errors) > 0
+
+
+def test_every_worker_has_one_blas_thread(trial, tmp_path, monkeypatch):
+    for name in module.THREADS:
+        monkeypatch.delenv(name, raising=False)
+    one = dataclasses.replace(trial, stack=OneThreadTask(), probes=1)
+    table = Study(one, 2, SEED, jobs=2).run(tmp_path / "results")
+    assert table.column("error").null_count == table.num_rows
+    assert not any(name in os.environ for name in module.THREADS)
+
+
 # ---------------------------------------------------------------- refusals
 
 
@@ -238,10 +340,40 @@ def test_a_folder_of_another_configuration_is_refused_before_any_work(study, fol
     }[other]
     (folder / "parts" / "trial_000000.parquet").unlink()
     before = (folder / "probes.parquet").read_bytes()
-    with pytest.raises(ResultsError, match=r"another configuration.*another --out"):
+    where = {"object": "radius", "stack": "priorities"}.get(other, other)
+    with pytest.raises(ResultsError, match=rf"another configuration: .*{where}.*another --out"):
         changed.run(folder)
     assert ran == []
     assert (folder / "probes.parquet").read_bytes() == before
+
+
+def test_another_package_source_is_said(study, folder, monkeypatch):
+    monkeypatch.setattr(fingerprint, "PACKAGE", folder)
+    with pytest.raises(ResultsError, match="another configuration: hqp_grasp differs; take"):
+        study.run(folder)
+
+
+def test_only_the_first_differences_are_told(study, folder):
+    trial = Trial(Scene(object=Cylinder(0.04, 0.1)), stack_of("m"), probes=2, landing=False)
+    with pytest.raises(ResultsError, match=r"another configuration: .*, and \d more; take another"):
+        Study(trial, TRIALS, SEED + 1).run(folder)
+
+
+def test_what_cannot_be_compared_runs_in_a_fresh_folder_and_is_never_continued(
+    trial, tmp_path, ran
+):
+    @dataclasses.dataclass(frozen=True)
+    class InnerTask(ForceTask):
+        pass
+
+    study = Study(dataclasses.replace(trial, stack=InnerTask(), probes=1), 1)
+    out = tmp_path / "results"
+    assert study.run(out).column("error").null_count == 2
+    with pytest.raises(
+        ResultsError, match=r"cannot be told: .*InnerTask.*inside a function.*--out"
+    ):
+        study.run(out)
+    assert ran == [0]
 
 
 def test_results_that_do_not_say_what_they_are_of_are_refused(study, folder, ran):
@@ -266,6 +398,7 @@ def test_a_folder_that_cannot_be_written_is_named_before_any_work(study, tmp_pat
         ({"trials": 0}, "trials must be at least 1; got 0"),
         ({"seed": -1}, "seed must be at least 0; got -1"),
         ({"jobs": 0}, "jobs must be at least 1; got 0"),
+        ({"trials": -3}, "trials must be at least 1; got -3"),
     ],
 )
 def test_a_wrong_setting_is_named(trial, setting, message):
