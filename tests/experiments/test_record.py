@@ -80,7 +80,7 @@ def test_status_and_rank_of_a_law_are_those_of_its_level_in_the_step_that_led_th
     assert all(record.rows[0][f"{c}_{n}"] is None for c in ("status", "rank") for n in ("force",))
     before = record.grasps[0]
     for row in record.rows[1:]:
-        solution = HQP(rank_tolerance=1e-6).solve(controller.stack.levels(before))
+        solution = controller.form.plan(controller.stack, before).solution
         before = next((grasp for told, grasp in felt(record) if told is row), before)
         force, both, height = solution.levels[-3:]
         assert (row["status_force"], row["rank_force"]) == (force.status, force.rank)
