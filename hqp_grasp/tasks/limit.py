@@ -34,7 +34,7 @@ class Limit(ABC):
         """lower ≤ A x ≤ upper at this grasp."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class MinkLimit(Limit):
     """A limit of mink, G Δq_full ≤ h, carried over to the independent joints: G C x ≤ h."""
 
@@ -50,16 +50,6 @@ class MinkLimit(Limit):
                     f"{type(self.limit).__name__} keeps no model: pass MinkLimit(limit, model)"
                 )
             object.__setattr__(self, "model", model)
-
-    def __repr__(self) -> str:
-        # Says all that mink's limit holds, and no address: results folders are told apart by it.
-        kept = {k: v for k, v in vars(self.limit).items() if not k.startswith("_")}
-        text = ", ".join(
-            f"{k}={np.array2string(np.asarray(v), threshold=10**6)}"
-            for k, v in sorted(kept.items())
-            if isinstance(v, (int, float, str, np.ndarray))
-        )
-        return f"MinkLimit({type(self.limit).__name__}({text}), dt={self.dt})"
 
     @property
     def priority(self) -> Priority:  # type: ignore[override]
