@@ -55,9 +55,9 @@ class MinkLimit(Limit):
         # Says all that mink's limit holds, and no address: results folders are told apart by it.
         kept = {k: v for k, v in vars(self.limit).items() if not k.startswith("_")}
         text = ", ".join(
-            f"{k}={np.array2string(np.asarray(v), threshold=10**6)}"
+            f"{k}={v.tolist() if isinstance(v, np.ndarray) else v}"
             for k, v in sorted(kept.items())
-            if isinstance(v, (int, float, str, np.ndarray))
+            if isinstance(v, int | float | str | list | tuple | np.ndarray)
         )
         return f"MinkLimit({type(self.limit).__name__}({text}), dt={self.dt})"
 
