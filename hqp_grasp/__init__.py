@@ -39,6 +39,7 @@ from hqp_grasp.tasks import (
 )
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.touch.probe import Probe
+from hqp_grasp.touch.sensing import sense
 from hqp_grasp.world.robot import Robot, RobotDescription
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
@@ -94,6 +95,7 @@ __all__ = [
     "ik_levels",
     "load_history",
     "save_history",
+    "sense",
     "solve_ik",
     "solvers",
     "stack_of",
