@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -13,10 +13,15 @@ from hqp_grasp.grasp import Grasp, Miss
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.touch.probe import Probe
+from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
-UPRIGHT = 0.05  # [–] vertical part of the normal of an upright side, at most
+MAX_PLACES = 24  # of the palm, before a draw is given up
+SHIFT = 0.01  # [m] the palm moves by this along the vertical, away from an edge that was met,
+TURN = np.radians(15.0)  # [rad] and turns by this about its approach axis,
+BACK = 2  # having withdrawn by so many advances
+CLOSINGS = 16  # sampled postures of closing fingers
 MAX_IK_STEPS = 60
 IK_STEP = 0.3  # [rad]
 IK_TOLERANCE = 1e-4  # [m, rad]
@@ -36,12 +41,16 @@ class Start:
     """Draws postures until the hand touches with every finger.
 
     Adduction, elevation and horizontal offset of the palm are uniform over the ranges; the
-    defaults are the paper's (section 4). What it leaves open: the approach axis meets the object's
-    axis at its middle, from the robot's side (a draw beyond the object is mirrored), the
-    opposition axis is horizontal, and the palm advances along the approach axis, by `advance` at a
-    time, until all fingers reach. A draw is rejected where the arm cannot go, a fingertip meets an
-    edge or the top instead of the upright side, or another link touches too. A hand without an arm
-    is placed where the draw says.
+    defaults are the paper's (section 4). What it leaves open: the palm faces the object's middle
+    from the robot's side (a draw beyond the object is mirrored), its opposition axis horizontal.
+    It begins where the fingers barely reach, a whole number of `advance` nearer than drawn, or
+    farther, and advances along the approach axis until all fingers touch.
+
+    Where a fingertip then meets an edge or an end face, the palm withdraws, moves along the
+    vertical and turns about the approach axis, both so that this finger comes nearer the middle,
+    and advances again. A draw is rejected where the arm cannot go, another link touches, or no
+    place of MAX_PLACES lets every fingertip touch the side. A hand without an arm is placed where
+    the draw says.
     """
 
     adduction: tuple[float, float] = (np.radians(10.0), np.radians(90.0))  # [rad]
@@ -71,54 +80,109 @@ class Start:
             adduction = rng.uniform(*self.adduction)
             elevation = rng.uniform(*self.elevation)
             offset = np.array([-abs(rng.uniform(*self.offset)), rng.uniform(*self.offset)])
-            distance = float(np.linalg.norm(offset))
-            while distance > 0.0:
-                p_palm, z = _palm_goal(scene, elevation, distance, offset)
-                found = _reach(scene, adduction, p_palm, z)
-                if found is None:
-                    last = "the arm cannot reach the drawn posture"
-                    break
-                placed, q = found
-                touched = probe_in(placed).touch(q)
-                if isinstance(touched, Grasp):
-                    last = _flaw(touched)
-                    if not last:
-                        return FirstTouch(placed, touched, rejected)
-                    break
-                last = f"{touched.reason.value} ({touched.where})"
-                if touched.reason is not Miss.NO_TOUCH:
-                    break
-                distance -= self.advance * np.cos(elevation)
+            drawn = float(np.linalg.norm(offset)) / np.cos(elevation)
+            heading = float(np.arctan2(-offset[1], -offset[0]))
+            hand = _open_hand(robot, adduction)
+            if hand is None:
+                last = "the hand cannot spread as drawn"
+                continue
+            reach = _reach(robot, hand[0]) + _extent(scene)
+            distance = drawn - self.advance * np.ceil((drawn - reach) / self.advance)
+            place = _Place(elevation, heading, distance)
+            found = self._first_touch(scene, probe_in, *hand, place)
+            if not isinstance(found, str):
+                return FirstTouch(*found, rejected)
+            last = found
         raise ReachError(
             f"{robot.description.name} touches the object at {scene.position} from none of "
             f"{self.max_draws} drawn postures (the last: {last}); move the object, or take another"
         )
 
+    def _first_touch(
+        self,
+        scene: Scene,
+        probe_in: Callable[[Scene], Probe],
+        q: np.ndarray,
+        fixed: list[int],
+        place: _Place,
+    ) -> tuple[Scene, Grasp] | str:
+        """Scene and grasp of the first touch that begins with the hand at `place`, or why none."""
+        told = ""
+        for _ in range(MAX_PLACES):
+            while True:
+                if place.distance <= 0.0:
+                    return told
+                reached = _placed(scene, q, fixed, place)
+                if reached is None:
+                    return "the arm cannot reach the drawn posture"
+                placed, q = reached  # the next posture is near this one
+                felt = probe_in(placed).touch(q)
+                if isinstance(felt, Grasp):
+                    break
+                told = f"{felt.reason.value} ({felt.where})"
+                if felt.reason is not Miss.NO_TOUCH:
+                    return told
+                place = replace(place, distance=place.distance - self.advance)
+            if felt.other_links:
+                return f"{felt.other_links[0]} touches the object"
+            vertical = felt.normals[:, 2]
+            worst = int(np.abs(vertical).argmax())
+            if abs(vertical[worst]) <= scene.object.steepest:
+                return placed, felt
+            told = f"{felt.contacts[worst].name} meets an edge or an end of the object"
+            back = place.distance + BACK * self.advance
+            place = replace(_nearer_the_middle(placed, felt, worst, place), distance=back)
+        return told
 
-def _flaw(grasp: Grasp) -> str:
-    """Why a touch is no start, empty where it is one."""
-    if grasp.other_links:
-        return f"{grasp.other_links[0]} touches the object"
-    for contact in grasp.contacts:
-        if abs(contact.normal[2]) > UPRIGHT:
-            return f"{contact.name} meets an edge or the top of the object"
-    return ""
+
+@dataclass(frozen=True)
+class _Place:
+    """A pose of the palm, facing a point above the object's middle."""
+
+    elevation: float  # [rad] of the approach axis, below horizontal
+    heading: float  # [rad] of the approach axis, seen from above, from the x axis
+    distance: float  # [m] of the palm from that point
+    height: float = 0.0  # [m] of that point above the middle
+    turn: float = 0.0  # [rad] about the approach axis; at 0 the opposition axis is horizontal
+
+    @property
+    def approach(self) -> np.ndarray:
+        """The approach axis (3,), world."""
+        level = np.cos(self.elevation)
+        across, along = np.sin(self.heading), np.cos(self.heading)
+        return np.array([level * along, level * across, -np.sin(self.elevation)])
+
+    def position(self, middle: np.ndarray) -> np.ndarray:
+        """p_palm (3,) [m], world, for an object whose middle is there (3,)."""
+        return middle + [0.0, 0.0, self.height] - self.distance * self.approach
+
+    def rotation(self, R_near: np.ndarray) -> np.ndarray:
+        """R_world_palm (3, 3): of the two, that whose x axis is, unturned, nearer to R_near's."""
+        z = self.approach
+        x = np.array([-np.sin(self.heading), np.cos(self.heading), 0.0])
+        x *= np.sign(R_near[:, 0] @ x) or 1.0
+        y = np.array(
+            [z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0]]
+        )
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        return np.column_stack([c * x + s * y, c * y - s * x, z])
 
 
-def _palm_goal(
-    scene: Scene, elevation: float, distance: float, offset: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where the palm goes (3,) [m] and its approach axis (3,), world, on the side of `offset`."""
-    heading = -offset / np.linalg.norm(offset)
-    z = np.array([*(np.cos(elevation) * heading), -np.sin(elevation)])
-    return np.array(scene.position) - distance / np.cos(elevation) * z, z
-
-
-def _reach(
-    scene: Scene, adduction: float, p_palm: np.ndarray, z: np.ndarray
-) -> tuple[Scene, np.ndarray] | None:
-    """Joints that bring the palm to p_palm, fingers open; None where the arm cannot."""
+def _nearer_the_middle(scene: Scene, felt: Grasp, finger: int, place: _Place) -> _Place:
+    """A little lower or higher, and turned, so that a finger leaves the end that it met."""
     robot = scene.articulated
+    lever = robot.centers(felt.q)[finger] - robot.palm(felt.q)[0]
+    z = place.approach
+    rises = np.sign(z[0] * lever[1] - z[1] * lever[0])  # when the palm turns about z
+    end = np.sign(felt.normals[finger, 2])  # 1: the upper one
+    return replace(place, height=place.height - end * SHIFT, turn=place.turn - end * rises * TURN)
+
+
+def _open_hand(robot: Robot, adduction: float) -> tuple[np.ndarray, list[int]] | None:
+    """The home posture with fingers open and spread as drawn, and the joints of the hand.
+
+    None where the hand cannot spread so far.
+    """
     q = np.clip(robot.home, robot.q_lower, robot.q_upper)
     fixed = [j for joints in robot.flexion for j in joints]
     q[fixed] = robot.q_lower[fixed]
@@ -128,12 +192,37 @@ def _reach(
             return None
         q[spread] = adduction
         fixed.append(spread)
-    p_now, R_now = robot.palm(q)
-    x = np.cross([0.0, 0.0, 1.0], z)
-    x /= np.linalg.norm(x)
-    x *= np.sign(R_now[:, 0] @ x) or 1.0
-    R_palm = np.column_stack([x, np.cross(z, x), z])
+    return q, fixed
+
+
+def _reach(robot: Robot, q: np.ndarray) -> float:
+    """How far before the palm every fingertip can get while it closes from q (n,) [m]."""
+    p_palm, R_palm = robot.palm(q)
+    q, farthest = q.copy(), np.full(len(robot.flexion), -np.inf)
+    flexion = [j for joints in robot.flexion for j in joints]
+    for share in np.linspace(0.0, 1.0, CLOSINGS):
+        q[flexion] = (1.0 - share) * robot.q_lower[flexion] + share * robot.q_upper[flexion]
+        ahead = (robot.centers(q) - p_palm) @ R_palm[:, 2] + robot.tip_radius
+        farthest = np.maximum(farthest, ahead)
+    return float(farthest.min())
+
+
+def _extent(scene: Scene) -> float:
+    """Radius about its middle [m] within which the object lies."""
+    model = scene.model
+    geoms = model.geom_bodyid == model.body(OBJECT).id
+    return float((np.linalg.norm(model.geom_pos[geoms], axis=1) + model.geom_rbound[geoms]).max())
+
+
+def _placed(
+    scene: Scene, q: np.ndarray, fixed: list[int], place: _Place
+) -> tuple[Scene, np.ndarray] | None:
+    """Joints, from q on, that bring the palm to its place; None where the arm cannot."""
+    robot = scene.articulated
+    p_palm = place.position(np.array(scene.position))
+    R_palm = place.rotation(robot.palm(robot.home)[1])
     if not robot.description.arm:
+        p_now, R_now = robot.palm(q)
         turn = R_palm @ R_now.T
         return scene.rebased(p_palm - turn @ p_now, turn), q
     return _inverse_kinematics(scene, q, fixed, p_palm, R_palm)

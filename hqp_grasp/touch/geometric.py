@@ -11,7 +11,8 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, one_of
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
-from hqp_grasp.world.scene import OBJECT, Scene
+from hqp_grasp.world.objects import OBJECT
+from hqp_grasp.world.scene import Scene
 
 RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves
 TOUCH = 1e-9  # [m] gap at which a tip touches
@@ -40,7 +41,7 @@ class GeometricProbe:
     _local: threading.local = field(init=False, repr=False)  # each thread's own MjData
     _tips: np.ndarray = field(init=False, repr=False)  # geom ids (k,)
     _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch
-    _object: int = field(init=False, repr=False)
+    _objects: tuple[int, ...] = field(init=False, repr=False)  # geom ids of what is felt
     _speed: np.ndarray = field(init=False, repr=False)  # (k,) [m/rad] no tip closes faster
 
     def __post_init__(self) -> None:
@@ -54,11 +55,12 @@ class GeometricProbe:
                     "the geometric probe closes one joint a finger"
                 )
         put("_local", threading.local())
-        put("_object", model.geom(OBJECT).id)
         tips = [model.geom(p.geom).id for p in robot.description.contact_points]
         put("_tips", np.array(tips))
         touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        links = [g for g in np.flatnonzero(touching) if g != self._object and g not in tips]
+        objects = touching & (model.geom_bodyid == model.body(OBJECT).id)
+        put("_objects", tuple(int(g) for g in np.flatnonzero(objects)))
+        links = [g for g in np.flatnonzero(touching & ~objects) if g not in tips]
         put("_links", np.array(links, dtype=int))
         put("_speed", self._speed_bound())
 
@@ -131,7 +133,20 @@ class GeometricProbe:
         return Missed(reason, self.scene.articulated.description.contact_points[i].name)
 
     def _distance(self, geom: int, limit: float, ends: np.ndarray | None = None) -> float:
-        return mujoco.mj_geomDistance(self.scene.model, self._data, geom, self._object, limit, ends)
+        """Distance to the nearest geom of the object, `limit` where all are farther.
+
+        `ends` (6,) takes the nearest points, on `geom` and on the object.
+        """
+        model, data = self.scene.model, self._data
+        nearest = limit
+        for i, other in enumerate(self._objects):
+            found = np.zeros(6) if ends is not None and i else ends
+            distance = mujoco.mj_geomDistance(model, data, geom, other, limit, found)
+            if distance < nearest:
+                nearest = distance
+                if ends is not None and i:
+                    ends[:] = found
+        return nearest
 
     def _gap(self, i: int) -> float:
         return self._distance(int(self._tips[i]), REACH)

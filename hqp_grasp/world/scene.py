@@ -10,85 +10,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, positive
+from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import as_array
+from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
 from hqp_grasp.world.robot import Robot, RobotDescription
 
-OBJECT = "object"  # name of the object's body and geom in a scene
-OBJECT_COLOUR = (0.85, 0.55, 0.25, 1.0)
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """An upright cylinder."""
-
-    radius: float  # [m]
-    height: float = 0.12  # [m]
-
-    def __post_init__(self) -> None:
-        positive("Cylinder.radius", self.radius)
-        positive("Cylinder.height", self.height)
-
-    def add_geom(self, spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
-        """Put the geom into `body`, centred."""
-        body.add_geom(
-            name=OBJECT,
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=[self.radius, self.height / 2.0, 0.0],
-            rgba=OBJECT_COLOUR,
-        )
-
-
-@dataclass(frozen=True)
-class Prism:
-    """An upright prism over a convex polygon, its corners counter-clockwise around the origin."""
-
-    polygon: tuple[tuple[float, float], ...]  # (m, 2) [m]
-    height: float = 0.12  # [m]
-
-    def __post_init__(self) -> None:
-        positive("Prism.height", self.height)
-        try:
-            corners = np.asarray(self.polygon, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"Prism.polygon must be corners (x, y); got {self.polygon!r}"
-            ) from error
-        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-            raise InputError(f"Prism.polygon needs at least 3 corners (x, y); got {self.polygon!r}")
-        if not np.isfinite(corners).all():
-            raise InputError("Prism.polygon must be finite")
-        edges = np.roll(corners, -1, axis=0) - corners
-        following = np.roll(edges, -1, axis=0)
-        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-        inside = corners[:, 0] * edges[:, 1] - corners[:, 1] * edges[:, 0]
-        bearings = np.arctan2(corners[:, 1], corners[:, 0])
-        once = (np.roll(bearings, -1) < bearings).sum() == 1  # a star goes around twice
-        if not ((turns > 0.0).all() and (inside > 0.0).all() and once):
-            raise InputError(
-                "Prism.polygon must be strictly convex, counter-clockwise, around the origin"
-            )
-        object.__setattr__(self, "polygon", tuple((float(x), float(y)) for x, y in corners))
-
-    @classmethod
-    def regular(cls, sides: int, side: float, height: float = 0.12) -> Prism:
-        """A regular polygon with sides of `side` [m], one corner on the x axis."""
-        positive("Prism side", side)
-        if sides < 3:
-            raise InputError(f"Prism.regular needs at least 3 sides; got {sides}")
-        angles = 2.0 * np.pi * np.arange(sides) / sides
-        radius = side / (2.0 * np.sin(np.pi / sides))
-        corners = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        return cls(tuple(map(tuple, corners)), height)
-
-    def add_geom(self, spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
-        """Put the geom into `body`, centred."""
-        half = self.height / 2.0
-        corners = [(x, y, z) for z in (-half, half) for x, y in self.polygon]
-        spec.add_mesh(name=OBJECT, uservert=np.ravel(corners))
-        body.add_geom(
-            name=OBJECT, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=OBJECT, rgba=OBJECT_COLOUR
-        )
+CCD_TOLERANCE = 1e-12  # [m] nearest points of meshes, down to the smallest gaps
+CCD_ITERATIONS = 200
 
 
 @dataclass(frozen=True)
@@ -99,13 +27,15 @@ class Scene:
     """
 
     robot: str | Path = "wam_bhand"
-    object: Cylinder | Prism = Cylinder(radius=0.05)
+    object: Cylinder | Prism | Body = Cylinder(radius=0.05)
     position: tuple[float, float, float] = (0.72, 0.0, 0.2)  # [m] world
     base: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # [m], unit quaternion w x y z
 
     def __post_init__(self) -> None:
-        if not isinstance(self.object, Cylinder | Prism):
-            raise InputError(f"unknown object {self.object!r}; choose one of: Cylinder, Prism")
+        if not isinstance(self.object, Cylinder | Prism | Body):
+            raise InputError(
+                f"unknown object {self.object!r}; choose one of: Cylinder, Prism, Body"
+            )
         try:
             position = as_array("Scene.position", self.position, (3,))
         except InputError as error:
@@ -130,7 +60,9 @@ class Scene:
             for root in spec.worldbody.bodies:
                 root.set_frame(frame)
             body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
-            self.object.add_geom(spec, body)
+            self.object.add_geoms(spec, body)
+            spec.option.ccd_tolerance = CCD_TOLERANCE
+            spec.option.ccd_iterations = CCD_ITERATIONS
             return spec.compile()
         except ValueError as error:
             raise InputError(f"{description.xml.name} does not compile: {error}") from error
