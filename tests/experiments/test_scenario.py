@@ -276,14 +276,17 @@ def test_the_band_around_the_median_spans_all_trials(ran):
         assert (at.min(), at.max()) == (angle[:, probe].min(), angle[:, probe].max())
 
 
-def test_importing_the_scenarios_leaves_matplotlibs_backend_to_its_user():
+def test_the_figure_leaves_matplotlibs_backend_to_its_user(ran, tmp_path):
     code = (
         "import matplotlib; matplotlib.use('svg');"
-        "import hqp_grasp, hqp_grasp.experiments.scenario, sys;"
+        "import hqp_grasp, sys; from pathlib import Path; import pyarrow.parquet as pq;"
+        "from hqp_grasp.experiments.scenario import convergence;"
+        f"convergence(pq.read_table({str(ran[0] / 'probes.parquet')!r}), '', Path('figure.png'));"
         "assert matplotlib.get_backend() == 'svg';"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path)
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_with_every_trial_lost_there_still_is_a_summary_and_a_figure(ran, tmp_path):

@@ -246,3 +246,68 @@ def test_a_law_that_lacks_what_it_needs_says_so_when_the_levels_are_asked_for():
     assert names((F >> M).levels(bare)) == ["contact", "force", "moment"]
     with pytest.raises(InputError, match="second derivatives"):
         (F >> K).levels(bare)
+
+
+# ---------------------------------------------------------------- laws of one's own
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnTask(ForceTask):
+    """The force law, its answers changed by a rule."""
+
+    change: str = "none"
+
+    def error(self, grasp):
+        f = super().error(grasp)
+        if self.change == "raises":
+            return f[7]
+        return {"column": f[:, None], "short": f[:2], "list": f.tolist()}.get(self.change, f)
+
+    def jacobian(self, grasp):
+        J = super().jacobian(grasp)
+        return {"transposed": J.T, "list": J.tolist()}.get(self.change, J)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("column", r"the law 'own': error must have shape \(r,\) .*got \(3, 1\) and \(3, 11\)"),
+        ("short", r"'own': .* \(2,\) and jacobian \(2, 11\); got \(2,\) and \(3, 11\)"),
+        ("transposed", r"'own': .* \(3,\) and jacobian \(3, 11\); got \(3,\) and \(11, 3\)"),
+    ],
+)
+def test_a_wrong_shape_names_the_law_and_the_right_one(grasp, change, message):
+    with pytest.raises(InputError, match=message):
+        (M >> OwnTask(change=change)).levels(grasp)
+    if change == "column":
+        with pytest.raises(InputError, match=r"'own': error must have shape \(r,\); got \(3, 1\)"):
+            (M >> OwnTask(change=change)).errors(grasp)
+
+
+def test_what_a_law_raises_says_which_law_it_was(grasp):
+    stack = M >> OwnTask(change="raises")
+    for ask in (stack.levels, stack.errors):
+        with pytest.raises(IndexError, match="out of bounds") as caught:
+            ask(grasp)
+        assert caught.value.__notes__ == ["raised by the law 'own' (OwnTask)"]
+
+
+def test_a_law_may_answer_with_lists(grasp):
+    (level,) = Stack.of(OwnTask(change="list")).law_levels(grasp)[1:]
+    np.testing.assert_array_equal(level.A, OwnTask().jacobian(grasp))
+    errors = (M >> OwnTask(change="list")).errors(grasp)
+    assert list(errors) == ["moment", "own"]
+    np.testing.assert_array_equal(errors["own"], F.error(grasp))
+
+
+@pytest.mark.parametrize("compose", [lambda: F >> M >> F, lambda: F + ForceTask(radius=0.1)])
+def test_two_laws_of_one_name_are_refused(compose):
+    with pytest.raises(InputError, match=r"two laws .* are named 'force'.*a `name` of its own"):
+        compose()
+
+
+def test_a_subclass_with_a_name_of_its_own_is_another_law():
+    class FarForceTask(ForceTask):
+        name = "far"
+
+    assert (F >> FarForceTask(radius=0.1)).name == "force ▷ far"
