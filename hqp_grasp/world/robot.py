@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import threading
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +19,10 @@ from hqp_grasp.grasp import Contact, Grasp
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
+# What a robot.toml may say, and what of each contact point. The description is for people; force and
+# torque name sensors, which nothing here reads yet.
+ENTRIES = ("model", "description", "home", "palm", "arm", "adduction", "velocity", "contact_points")
+POINT_ENTRIES = ("name", "site", "geom", "flexion", "force", "torque")
 CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
 
 
@@ -55,14 +61,14 @@ class RobotDescription:
             folder = root / one_of(
                 "robot", robot, sorted(p.parent.name for p in root.glob("*/*.toml"))
             )
-        text = (folder / "robot.toml").read_text()
+        file = folder / "robot.toml"
         try:
-            data = tomllib.loads(text)
+            data = _entries(file, tomllib.loads(file.read_text()), ENTRIES)
             points = tuple(
                 ContactPoint(
                     _text(p["name"]), _text(p["site"]), _text(p["geom"]), _texts(p["flexion"])
                 )
-                for p in data["contact_points"]
+                for p in (_entries(file, p, POINT_ENTRIES) for p in data["contact_points"])
             )
             return cls(
                 name=folder.name,
@@ -75,13 +81,11 @@ class RobotDescription:
                 contact_points=points,
             )
         except tomllib.TOMLDecodeError as error:
-            raise ModelError(f"{folder / 'robot.toml'} is not valid TOML: {error}") from error
+            raise ModelError(f"{file} is not valid TOML: {error}") from error
         except KeyError as error:
-            raise ModelError(f"{folder / 'robot.toml'} lacks the entry {error}") from error
+            raise ModelError(f"{file} lacks the entry {error}") from error
         except (TypeError, AttributeError, InputError) as error:
-            raise ModelError(
-                f"{folder / 'robot.toml'}: an entry is of the wrong kind: {error}"
-            ) from error
+            raise ModelError(f"{file}: an entry is of the wrong kind: {error}") from error
 
     def spec(self) -> mujoco.MjSpec:
         """The authored model, ready to be composed with others."""
@@ -327,6 +331,18 @@ class Robot:
                 f"{name} must be {self.n} finite angles, for {', '.join(self.joints)}; got {q!r}"
             )
         return array
+
+
+def _entries(file: Path, table: object, known: tuple[str, ...]) -> dict[str, Any]:
+    """Return `table`; raise for an entry that is not known, which would be ignored otherwise."""
+    if not isinstance(table, dict):
+        raise InputError(f"{table!r} is no table")
+    for entry in table:
+        if entry not in known:
+            near = difflib.get_close_matches(entry, known, n=1)
+            hint = f"did you mean {near[0]!r}? Entries" if near else "entries"
+            raise ModelError(f"{file}: unknown entry {entry!r}; {hint} are: {', '.join(known)}")
+    return table
 
 
 def _text(value: object) -> str:

@@ -1,5 +1,7 @@
 """A robot read from its folder: couplings, ranges, and the motion of its contact points."""
 
+import re
+
 import mujoco
 import numpy as np
 import pinocchio as pin
@@ -362,9 +364,9 @@ def test_a_missing_entry_is_named(tmp_path, entry):
     if entry in ("model", "home", "palm", "arm"):
         toml = "\n".join(line for line in TOML.splitlines() if not line.startswith(entry))
     elif entry == "velocity":
-        toml = change(TOML, "[velocity]", "[speeds]")
+        toml = change(TOML, "[velocity]\nlift = 0.1\nproximal = 2.0\n", "")
     else:
-        toml = change(TOML, "[[contact_points]]", "[[points]]")
+        toml = TOML.split("[[contact_points]]")[0]
     with pytest.raises(ModelError, match=rf"robot\.toml lacks the entry '{entry}'"):
         build(tmp_path, toml=toml)
 
@@ -375,6 +377,23 @@ def test_a_contact_points_missing_entry_is_named(tmp_path, entry):
     points = "\n".join(line for line in points.splitlines() if not line.startswith(entry))
     with pytest.raises(ModelError, match=rf"robot\.toml lacks the entry '{entry}'"):
         build(tmp_path, toml=f"{head}[[contact_points]]\n{points}")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('palm = "palm"', 'plam = "palm"', "unknown entry 'plam'; did you mean 'palm'?"),
+        ("[velocity]", "[velocities]", "unknown entry 'velocities'; did you mean 'velocity'?"),
+        ('arm = ["lift"]', 'arm = ["lift"]\naduction = "lift"', "did you mean 'adduction'?"),
+        ('geom = "tip"', 'gemo = "tip"', "unknown entry 'gemo'; did you mean 'geom'?"),
+        ('site = "tip_center"', 'site = "tip_center"\nsize = 1', "'size'; did you mean 'site'?"),
+        ('home = "home"', 'home = "home"\nxyz = 1', "unknown entry 'xyz'; entries are: model, "),
+    ],
+)
+def test_a_misspelt_entry_comes_with_the_nearest_valid_one(tmp_path, old, new, message):
+    """Also where nothing is missing: an optional entry would be ignored without a word."""
+    with pytest.raises(ModelError, match=rf"robot\.toml: .*{re.escape(message)}"):
+        build(tmp_path, toml=change(TOML, old, new))
 
 
 def test_a_robot_toml_that_is_not_toml_is_refused(tmp_path):
@@ -396,6 +415,7 @@ def test_a_velocity_that_is_no_number_above_zero_is_refused(tmp_path, velocity):
         ('model = "tiny.xml"', "model = 1"),
         ('flexion = ["proximal"]', "flexion = 1"),
         ('site = "tip_center"', "site = 1"),
+        ("[[contact_points]]", "[contact_points]"),
     ],
 )
 def test_entries_of_the_wrong_kind_are_refused(tmp_path, old, new):
