@@ -19,7 +19,7 @@ from hqp_grasp.grasp import Contact, Grasp
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
-# What a robot.toml may say, and what of each contact point. The description is for people; force and
+# What a robot.toml may say, and what of each contact point. A description is for people; force and
 # torque name sensors, which nothing here reads yet.
 ENTRIES = ("model", "description", "home", "palm", "arm", "adduction", "velocity", "contact_points")
 POINT_ENTRIES = ("name", "site", "geom", "flexion", "force", "torque")

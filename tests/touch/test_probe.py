@@ -9,6 +9,7 @@ import tiny_hand
 from surfaces import nearest_on_circle, nearest_on_polygon
 from tiny_hand import LENGTH, STIFF, TIP, change
 
+from hqp_grasp.control.limits import StepLimit
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.touch.geometric import RETREAT, GeometricProbe
@@ -290,6 +291,30 @@ def test_a_finger_that_would_open_into_the_object_opens_all_the_way(tmp_path):
     assert grasp.q[1] == pytest.approx(expected, abs=AGAIN_TOL)
 
 
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.4])
+def test_a_finger_that_closed_by_a_whole_step_more_still_finds_the_object(tmp_path, share):
+    """A rod so thin that at the target, and for a third of a radian before, the tip is past it."""
+    radius, bearing = 0.005, 1.5
+    distance = distance_of_share(radius, share)
+    expected = touch_angle(radius, distance, bearing)
+    left_behind = 2.0 * bearing - expected  # where the tip comes out on the other side
+    step = StepLimit().joint
+    assert left_behind < expected + 0.4 * step
+    grasp = single(tmp_path, radius, distance, bearing).touch(np.array([0.0, expected + step]))
+    assert isinstance(grasp, Grasp)
+    assert grasp.q[1] == pytest.approx(expected, abs=AGAIN_TOL)
+
+
+def test_a_finger_opens_no_wider_than_it_is_told_where_nothing_is_in_its_way(tmp_path):
+    """Past the object by more than its retreat, it closes on the far side, on nothing."""
+    radius, bearing = 0.005, 1.5
+    distance = distance_of_share(radius, 0.3)
+    left_behind = 2.0 * bearing - touch_angle(radius, distance, bearing)
+    probe = single(tmp_path, radius, distance, bearing)
+    missed = probe.touch(np.array([0.0, left_behind + RETREAT + 1e-3]))
+    assert missed == Missed(Miss.NO_TOUCH, "finger")
+
+
 # ---------------------------------------------------------------- ways to miss
 
 
@@ -356,6 +381,28 @@ def test_other_links_can_block_instead(crowded):
     assert isinstance(missed, Missed)
     assert missed.reason is Miss.OTHER_LINK
     assert missed.where in grasp.other_links
+
+
+@pytest.mark.parametrize(("depth", "touches"), [(1e-5, True), (1e-6, True), (-1e-6, False)])
+def test_a_link_touches_as_soon_as_it_is_in_the_object_by_a_thousandth_of_a_millimetre(
+    tmp_path, depth, touches
+):
+    """A knuckle beside the finger, `depth` inside the cylinder."""
+    radius, knuckle, bearing = 0.05, 0.005, 1.5
+    distance = distance_of_share(radius, 0.6)
+    where = distance - radius - knuckle + depth
+    at = f"{where * np.cos(bearing):.17g} {where * np.sin(bearing):.17g} 0"
+    geom = f'<geom name="knuckle" type="sphere" size="{knuckle}" pos="{at}" mass="0"/>'
+    xml = change(STIFF, '<site name="palm"/>', f'<site name="palm"/>{geom}')
+    position = (distance * np.cos(bearing), distance * np.sin(bearing), 0.0)
+    scene = Scene(tiny_hand.write(tmp_path, xml), Cylinder(radius, TALL), position)
+    for links in ("pass", "block"):
+        felt = GeometricProbe(scene, links).touch(np.zeros(2))
+        if touches and links == "block":
+            assert felt == Missed(Miss.OTHER_LINK, "knuckle")
+        else:
+            assert isinstance(felt, Grasp)
+            assert felt.other_links == (("knuckle",) if touches else ())
 
 
 def test_where_no_other_link_touches_blocking_changes_nothing(world):
