@@ -34,6 +34,8 @@ help:
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make docs    build the site into site/'
 	@echo 'make bench   compare with peers, print ratios'
+	@echo 'make mutants   spoil the code in 28 places, see whether tests notice (an hour)'
+	@echo 'make results   run all that README and docs quote, into out/results and docs/images (an hour)'
 	@echo 'make clean   remove what these made, except results in out/'
 	@echo 'Each installs what it needs into .venv first; PYTHON=python3.12 chooses the Python.'
 
@@ -56,7 +58,49 @@ docs: $(READY_DEV)
 	$(PY) -m mkdocs build --strict
 
 bench: $(READY_BENCH)
-	@set -e; for file in benchmarks/*.py; do echo "$$file"; $(PY) "$$file"; done
+	@set -e; for file in $(filter-out benchmarks/mutants.py,$(wildcard benchmarks/*.py)); do \
+	  echo "$$file"; $(PY) "$$file"; done
+
+mutants: $(READY_DEV)
+	$(PY) benchmarks/mutants.py
+
+# Every command whose figures README.md and docs/ quote. What each prints goes into $(RESULTS), pictures
+# into docs/images/. tests/test_packaging.py knows if docs quote a command that is not here.
+RESULTS := out/results
+keep = $(PY) $(2) > $(RESULTS)/$(1).txt
+cylinder = $(PY) scenarios/cylinder.py --trials 40 $(2) --out $(RESULTS)/$(1) > $(RESULTS)/$(1).txt
+
+results: $(READY_BENCH)
+	rm -rf $(RESULTS)
+	mkdir -p $(RESULTS)
+	$(call cylinder,cylinder-0,--probes 40 --seed 0)
+	$(call cylinder,cylinder-1,--probes 40 --seed 1)
+	$(call cylinder,cylinder-2,--probes 40 --seed 2)
+	$(call cylinder,force-moment,--probes 40 --seed 0 --stack fm)
+	$(call cylinder,wide-caps-0,--probes 40 --seed 0 --joint-cap 0.5 --contact-cap 0.04)
+	$(call cylinder,wide-caps-1,--probes 40 --seed 1 --joint-cap 0.5 --contact-cap 0.04)
+	$(call cylinder,wide-caps-2,--probes 40 --seed 2 --joint-cap 0.5 --contact-cap 0.04)
+	$(call cylinder,eq7,--probes 40 --seed 0 --kinematic-error eq7)
+	$(call cylinder,no-landing,--probes 40 --seed 0 --no-landing)
+	$(call cylinder,clipped,--probes 40 --seed 0 --form clipped)
+	$(call cylinder,paper,--probes 60 --seed 0 --form paper)
+	$(call cylinder,links-block,--probes 40 --seed 0 --links block)
+	cp $(RESULTS)/cylinder-0/convergence.png docs/images/cylinder-convergence.png
+	$(call keep,probing,benchmarks/probing.py)
+	$(call keep,limits,benchmarks/limits.py)
+	$(call keep,limits-6,benchmarks/limits.py --trials 6)
+	$(call keep,equivalence-0,benchmarks/equivalence.py --trials 4 --probes 30)
+	$(call keep,equivalence-1,benchmarks/equivalence.py --trials 4 --probes 30 --seed 1)
+	$(call keep,near-singular,benchmarks/near_singular.py --plot docs/images/near-singular.png)
+	$(call keep,strictness,benchmarks/strictness.py --seed 0)
+	$(call keep,where-time-goes,benchmarks/where_time_goes.py --problems 1000)
+	$(call keep,solvers,benchmarks/solvers.py)
+	$(call keep,solvers-sizes,benchmarks/solvers.py --sizes --problems 150 --checked 2 --plot docs/images/solvers.png)
+	$(call keep,fuzz,benchmarks/fuzz.py --problems 100000 --seed 3)
+	$(call keep,fuzz-oracle,benchmarks/fuzz.py --problems 2500 --seed 5 --against-oracle)
+	@set -e; for kind in easy mid hard; do for solver in proxqp daqp; do \
+	  $(PY) benchmarks/fuzz.py --kind three_level-$$kind --problems 1000 --solver $$solver --against-oracle; \
+	done; done > $(RESULTS)/fuzz-three-level.txt
 
 clean:
 	rm -rf .venv .venv-oldest build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache
