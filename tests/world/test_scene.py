@@ -229,26 +229,3 @@ def test_a_robot_that_uses_the_objects_name_is_refused(tmp_path):
     xml = tiny_hand.XML.replace('name="distal"', 'name="object"').replace('"distal"', '"object"')
     with pytest.raises((InputError, ModelError), match=r"tiny\.xml.*'object'"):
         Scene(tiny_hand.write(tmp_path, xml), Cylinder(0.05)).model  # noqa: B018
-
-
-# ---------------------------------------------------------------- fingerprints
-
-
-def test_equal_scenes_have_one_fingerprint():
-    assert Scene().fingerprint() == Scene(object=Cylinder(0.05)).fingerprint()
-
-
-def test_whatever_is_compiled_otherwise_has_another_fingerprint(tmp_path):
-    """Also a robot that changed in its folder: its name and its path are the same."""
-    folder = tiny_hand.write(tmp_path)
-    before = Scene(folder, Cylinder(0.02), (0.1, 0.1, 0.0))
-    marks = {
-        before.fingerprint(),
-        Scene(folder, Cylinder(0.021), (0.1, 0.1, 0.0)).fingerprint(),
-        Scene(folder, Cylinder(0.02), (0.1, 0.11, 0.0)).fingerprint(),
-        Scene(folder, Prism.regular(6, 0.02), (0.1, 0.1, 0.0)).fingerprint(),
-    }
-    tiny_hand.write(tmp_path, tiny_hand.change(tiny_hand.XML, 'range="0 3"', 'range="0 2.9"'))
-    after = Scene(folder, Cylinder(0.02), (0.1, 0.1, 0.0))
-    assert after == before
-    assert len(marks | {after.fingerprint()}) == 5
