@@ -71,6 +71,14 @@ def test_levels_that_repeat_or_contradict_those_above_are_left_as_they_are():
     assert_close(A @ answer.x, [1, 2, 3])
 
 
+@pytest.mark.parametrize(
+    ("miss", "status"), [(1e-15, "met"), (1e-12, "met"), (1e-7, "nearest"), (1e-4, "nearest")]
+)
+def test_a_level_is_met_to_rounding_and_no_further(miss, status):
+    answer = solve([equal([[1.0, 0.0]], [1.0]), equal([[1.0, 0.0]], [1.0 + miss])])
+    assert [level.status for level in answer.levels] == ["met", status]
+
+
 def test_rows_of_one_level_that_contradict_one_another_meet_in_the_middle():
     answer = solve([equal([[1, 0], [1, 0]], [0, 1])])
     assert_close(answer.x, [0.5, 0])

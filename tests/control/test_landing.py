@@ -1,0 +1,63 @@
+"""Landing: the fingertips arrive where the linear prediction put them."""
+
+import numpy as np
+import pytest
+
+from hqp_grasp.control.controller import Controller
+from hqp_grasp.control.landing import land
+from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
+from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.tasks import stack_of
+from hqp_grasp.world.scene import Scene
+
+ARRIVED = 1e-5  # [m]
+ROUNDING = 1e-9  # [–] of a limit
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def robot(scene):
+    return scene.articulated
+
+
+@pytest.fixture(scope="module")
+def steps(scene, robot):
+    """Grasps felt, each with the step that the laws ask for."""
+    stack = stack_of("fmk")
+    plan = Controller(robot, stack).form.plan
+    limited = Controller(robot, stack).stack
+    records = [Trial(scene, stack, probes=2).run((616, i)) for i in range(3)]
+    return [(g, plan(limited, g).x) for record in records for g in record.grasps]
+
+
+def missed(robot, grasp, x, landed):
+    """How far the tips are, at grasp.q + landed, from where J x says [m]."""
+    goal = robot.centers(grasp.q).ravel() + grasp.jacobian @ x
+    return np.abs(robot.centers(grasp.q + landed).ravel() - goal).max()
+
+
+def test_tips_that_would_be_centimetres_off_arrive_to_a_hundredth_of_a_millimetre(robot, steps):
+    stack = stack_of("fmk").within(StepLimit(2.0, 0.5), ConfigurationLimit(robot))
+    assert max(missed(robot, grasp, x, x) for grasp, x in steps) > 0.03
+    for grasp, x in steps:
+        assert missed(robot, grasp, x, land(robot, stack, grasp, x)) < ARRIVED
+
+
+def test_limits_come_before_landing(robot, steps):
+    stack = stack_of("fmk").within(StepLimit(), ConfigurationLimit(robot))
+    for grasp, x in steps:
+        landed = land(robot, stack, grasp, x)
+        assert missed(robot, grasp, x, landed) <= missed(robot, grasp, x, x) + ROUNDING
+        for level in stack.limit_levels(grasp):
+            assert np.abs(level.residual(landed)).max() <= ROUNDING
+
+
+def test_a_step_that_lands_by_itself_is_left_as_it_is(robot, steps):
+    stack = stack_of("fmk").within(StepLimit())
+    for grasp, x in steps:
+        tiny = 1e-4 * x
+        np.testing.assert_array_equal(land(robot, stack, grasp, tiny), tiny)
