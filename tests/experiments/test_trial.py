@@ -104,7 +104,8 @@ def test_different_seeds_give_different_starts(records):
 
 def test_rows_are_the_first_touch_and_one_for_each_probe(records):
     for record in records.values():
-        assert len(record.rows) == PROBES + 1 == len(record.grasps)
+        assert len(record.rows) == PROBES + 1
+        assert len(record.grasps) == sum(row["in_contact"] for row in record.rows)
         assert all(set(row) >= set(COLUMNS) for row in record.rows)
         assert not record.lost
 
@@ -155,7 +156,8 @@ def test_with_wide_caps_nearly_every_step_is_compared(scene, stack, records):
 
 def test_errors_in_the_rows_are_those_of_the_grasps(records):
     record = records[SEEDS[0]]
-    for row, grasp in zip(record.rows, record.grasps, strict=True):
+    felt = [row for row in record.rows if row["in_contact"]]
+    for row, grasp in zip(felt, record.grasps, strict=True):
         f = -grasp.normals.sum(axis=0)
         lever = grasp.positions - grasp.positions.mean(axis=0)
         m = np.cross(lever, -grasp.normals).sum(axis=0)
@@ -446,17 +448,17 @@ def test_at_a_limit_lower_laws_change_nothing_for_force(tight):
 
 
 def test_with_a_joint_at_its_limit_throughout_only_the_hierarchy_converges(
-    tmp_path, scene, stack, records
+    tmp_path, scene, stack, trial
 ):
     """The arm's first joint begins at its lower limit, and the laws go on pulling it further."""
-    first = records[SEEDS[2]].grasps[0]
+    first = trial.run(3).grasps[0]
     j = scene.articulated.index("wam_j1")
     lower = float(first.q[j])
     limited = narrowed_scene(tmp_path, scene, "wam_j1", "-2.6 2.6", (lower, 2.6))
     found = {}
     for form in ("hierarchy", "clipped"):
         hand = Hand(GeometricProbe(limited, links="pass"), first=first)
-        found[form] = Trial(limited, stack, probes=PROBES, form=form).run(SEEDS[2], hand)
+        found[form] = Trial(limited, stack, probes=PROBES, form=form).run(3, hand)
         assert set(found[form].column("limit_violation")) == {0.0}
     assert all(row["limit_active"] for row in found["hierarchy"].rows[1:])
     at = [grasp.q[j] for grasp in found["hierarchy"].grasps]
