@@ -119,6 +119,30 @@ def general(rng, *, max_n=40, max_levels=8, max_rows=12, scales=True):
     return levels
 
 
+def anything(rng):
+    """A `general` problem, every third with rows of rounding dust, and a rank tolerance for it.
+
+    Returns levels, and None for the default tolerance or 1e-12 … 1e-3.
+    """
+    levels = general(rng)
+    if rng.random() < 1 / 3:
+        levels = [_dusty(rng, level) if rng.random() < 0.5 else level for level in levels]
+    return levels, None if rng.random() < 0.4 else 10.0 ** rng.uniform(-12.0, -3.0)
+
+
+def _dusty(rng, level):
+    """One to three rows more, 1e-12 … 1e-17 of the level, that ask for what the others ask for."""
+    count, n = int(rng.integers(1, 4)), level.A.shape[1]
+    dust = 10.0 ** rng.uniform(-17.0, -12.0, (count, 1)) * rng.standard_normal((count, n))
+    asked = rng.integers(-1, 2, count) * np.abs(np.clip(0.0, level.lower, level.upper)).max()
+    order = rng.permutation(len(level.A) + count)
+    return Rows(
+        np.concatenate([level.A, np.linalg.norm(level.A, 2) * dust])[order],
+        np.append(level.lower, asked)[order],
+        np.append(level.upper, asked)[order],
+    )
+
+
 def _fraction(values, bits):
     """Round to multiples of 2^−bits."""
     return np.round(np.asarray(values) * 2.0**bits) / 2.0**bits

@@ -26,7 +26,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from hqp_grasp.errors import InputError
 from hqp_grasp.hierarchy.certificate import EPS, VANISHED
+from hqp_grasp.hierarchy.level import Stacked
 
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 40
@@ -251,7 +253,7 @@ def _only_entries(A):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _line_up(A, only, rough, rows, start, order, place):
+def _line_up(A, only, floor, rows, start, order, place):
     """Let the unknowns stand first that the first levels hold by rows of one entry, in their order.
 
     Such rows need no pick and no turn. Returns how many levels have no others.
@@ -260,24 +262,24 @@ def _line_up(A, only, rough, rows, start, order, place):
         order[j] = j
         place[j] = j
     c = 0
-    for k in range(len(rough)):
+    for k in range(len(floor)):
         for i in range(start[k], start[k + 1]):
             j = only[rows[i]]
-            if j < 0 or place[j] < c or abs(A[rows[i], j]) <= rough[k] * CLEAR:
+            if j < 0 or place[j] < c or abs(A[rows[i], j]) <= floor[k] * CLEAR:
                 return k
             there, other = place[j], order[c]
             order[c], order[there] = j, other
             place[j], place[other] = c, there
             c += 1
-    return len(rough)
+    return len(floor)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _pick(rows, V, W, Z, flat_w, flat_z, left, length, v, s, lo, hi, c, o, rough):
+def _pick(rows, V, W, Z, flat_w, flat_z, left, length, v, s, lo, hi, c, o, floor):
     """Pick rows lo:hi by the largest rest, and turn the directions so that c + r is the r-th's.
 
     Directions before o are unknowns and no part of it. Returns how many were picked, and whether
-    some came close to the rank tolerance `rough`.
+    some came close to the rank tolerance `floor`.
     """
     n = W.shape[1]
     for i in range(lo, hi):
@@ -300,9 +302,9 @@ def _pick(rows, V, W, Z, flat_w, flat_z, left, length, v, s, lo, hi, c, o, rough
                 best = left[i]
                 pick = i
         norm = np.sqrt(best)
-        if best == 0.0 or norm <= rough / (CLEAR * 10.0):
+        if best == 0.0 or norm <= floor / (CLEAR * 10.0):
             break
-        if norm <= rough * CLEAR:
+        if norm <= floor * CLEAR:
             ambiguous = True
         if pick != row:
             rows[pick], rows[row] = rows[row], rows[pick]
@@ -390,12 +392,12 @@ def _least_squares(work, lo, hi, c, r):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _begin(A, lower, upper, off, act, only, row_norm, rough, work):
+def _begin(A, lower, upper, off, act, only, row_norm, floor, work):
     """Line up the active rows, levels and unknowns for `_reduce`; the first levels may be done."""
     V, Z, order = work.V, work.Z, work.order
     n = len(order)
     ma = 0
-    for k in range(len(rough)):
+    for k in range(len(floor)):
         work.start[k] = ma
         for i in range(off[k], off[k + 1]):
             if act[i] != 0:
@@ -403,8 +405,8 @@ def _begin(A, lower, upper, off, act, only, row_norm, rough, work):
                 work.target[i] = upper[i] if act[i] > 0 else lower[i]
                 work.length[ma] = row_norm[i]
                 ma += 1
-    work.start[len(rough)] = ma
-    lined_up = _line_up(A, only, rough, work.rows, work.start, order, work.place)
+    work.start[len(floor)] = ma
+    lined_up = _line_up(A, only, floor, work.rows, work.start, order, work.place)
     for i in range(ma):
         for j in range(n):
             V[i, j] = A[work.rows[i], order[j]]
@@ -427,13 +429,13 @@ def _begin(A, lower, upper, off, act, only, row_norm, rough, work):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
+def _reduce(A, off, begin, end, o, frobenius, floor, work, x):
     """Lexicographic least squares of the active rows, as equalities at their target: x.
 
     Takes in levels begin … end − 1; those above are reduced. Directions before o are unknowns.
 
     What is left of a row, after it is reduced by c others, counts as nothing below DUST × c of
-    its length; singular values, below `rough` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
+    its length; singular values, below `floor` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
     """
     V, W, Z, xq, xv, rhs = work.V, work.W, work.Z, work.xq, work.xv, work.rhs
     n = len(x)
@@ -464,10 +466,10 @@ def _reduce(A, off, begin, end, o, frobenius, rough, work, x):
                 hi,
                 c,
                 o,
-                rough[k],
+                floor[k],
             )
             if ambiguous:
-                tol = rough[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
+                tol = floor[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
                 made = r
                 r = _rotate(lo, hi, c, o, r, tol, work)
                 work.turned[k] = r < made
@@ -520,7 +522,7 @@ def _weigh(levels, work):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _column(k, levels, rough, work):
+def _column(k, levels, floor, work):
     """Column k of lam (M, p + 1), the multipliers of the rows above for level k's optimality.
 
     A_kᵀ w_k + Σ_{j<k} A_jᵀ lam_jk = 0; the one behind the last of the `levels` taken in, p in the
@@ -542,7 +544,7 @@ def _column(k, levels, rough, work):
         return
     else:
         lo, hi = start[k], start[k + 1]
-        unasked = rough[k] * np.sqrt(_dot(work.wa, lo, work.wa, lo, hi - lo))
+        unasked = floor[k] * np.sqrt(_dot(work.wa, lo, work.wa, lo, hi - lo))
         for j in range(top):
             g[j] = 0.0
             h[j] = unasked
@@ -612,16 +614,6 @@ def _column(k, levels, rough, work):
                         h[j] += abs(W[i, j]) * size + rounding
 
 
-@njit(cache=True, error_model="numpy")
-def equalities(lower, upper):
-    """The active set of the equalities alone, (M,) int8."""
-    act = np.zeros(len(lower), np.int8)
-    for i in range(len(lower)):
-        if lower[i] == upper[i]:
-            act[i] = 2
-    return act
-
-
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _judge(own, side, w, room, push, doubt, scale):
     """Whether a column shows that an active row holds x back: 1 yes, −1 it pushes well, 0 neither.
@@ -668,7 +660,7 @@ def _broken(flat, lower, upper, act, x, start, end, work):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late, rough, work):
+def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late, floor, work):
     """Mark the active rows that hold x back although a level would gain by letting go.
 
     Returns how many, and the worst of those that the first such level names (−1: none), or where it
@@ -682,7 +674,7 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
         wrong[i] = 2 if (act[i] == 1 or act[i] == -1) and not kept[i] else 0
     k = 0
     while k <= levels and not (single and worst >= 0):
-        _column(k, levels, rough, work)
+        _column(k, levels, floor, work)
         scale = length
         if k < levels:
             scale = frobenius[k] * np.sqrt(_dot(w, off[k], w, off[k], off[k + 1] - off[k]))
@@ -711,18 +703,11 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
 
 
 @njit(cache=True, error_model="numpy")
-def search(A, lower, upper, off, act, frobenius, row_norm, rough, first, blocks, pivots):
+def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks, steps):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
-    Begins with the first `first` levels and takes in the next where these are settled. At each:
-    up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
-    at once, for as long as there are ever fewer of them. Then steps that move one row each, as
-    the primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
-    Sherikov & Wieber 2015); with blocks = 0 it is that method, from x = 0. Ends after
-    blocks + pivots steps at the latest; whether it found the optimum is for the certificate to
-    say. rank_tolerance < 0 asks for the default.
-
-    Returns x (n,), the multipliers (M, p + 1) explained at `_column`, and rank (p,).
+    See `search`. Returns x (n,), the multipliers (M, p + 1) explained at `_column`, rank (p,) and
+    the number of steps.
     """
     M, n = A.shape
     p = len(off) - 1
@@ -746,13 +731,16 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rough, first, blocks,
     fewest = M + 1
     begun = 0  # the step at which these levels began,
     alone = 0  # and one row at a time
-    for step in range(blocks + pivots):
+    for step in range(steps + 1):
+        last_step = step == steps  # what is found there is returned as it is
+        if last_step:
+            levels = p
         if reduced < 0:
-            reduced = _begin(A, lower, upper, off, act, only, row_norm, rough, work)
+            reduced = _begin(A, lower, upper, off, act, only, row_norm, floor, work)
             o = work.first[reduced]
         levels = max(levels, reduced)
         end = off[levels]
-        _reduce(A, off, reduced, levels, o, frobenius, rough, work, x)
+        _reduce(A, off, reduced, levels, o, frobenius, floor, work, x)
         reduced = levels
         length = np.sqrt(_dot(x, 0, x, 0, n))
         for k in range(levels):  # where x vanishes by cancellation, what the levels ask counts
@@ -764,16 +752,28 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rough, first, blocks,
                 length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
         for k in range(levels):
             for i in range(off[k], off[k + 1]):
-                work.slack[i] = (FEASIBLE * row_norm[i] + rough[k]) * length
+                work.slack[i] = (FEASIBLE * row_norm[i] + floor[k]) * length
         broken, block, alpha = _broken(flat, lower, upper, act, x, start, end, work)
         unwilling = 0
         drop = -1
-        if not single or block < 0:
-            late = 2 * (step - alone) > pivots  # Bland: the first one, so that it ends
+        if not single or block < 0 or last_step:
+            late = 2 * (step - alone) > steps  # Bland: the first one, so that it ends
             _complete(levels, o, work)
             unwilling, drop = _unwilling(
-                off, levels, act, frobenius, row_norm, length, kept, single, late, rough, work
+                off,
+                levels,
+                act,
+                frobenius,
+                row_norm,
+                length,
+                kept,
+                single and not last_step,
+                late,
+                floor,
+                work,
             )
+        if last_step:
+            break
         count = broken + unwilling
         if count == 0:
             if levels == p:
@@ -812,13 +812,41 @@ def search(A, lower, upper, off, act, frobenius, row_norm, rough, first, blocks,
             start[:] = x
             last, last_side = drop, act[drop]
             act[drop] = 0
-    else:
-        if reduced < 0:
-            reduced = _begin(A, lower, upper, off, act, only, row_norm, rough, work)
-            o = work.first[reduced]
-        _reduce(A, off, reduced, p, o, frobenius, rough, work, x)
-        _complete(p, o, work)
-        _weigh(p, work)
-        for k in range(p + 1):
-            _column(k, p, rough, work)
-    return x, work.lam, work.first[1:] - work.first[:-1]
+    return x, work.lam, work.first[1:] - work.first[:-1], step
+
+
+def search(
+    rows: Stacked, act: np.ndarray, first: int, blocks: int, steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
+
+    Begins with the first `first` levels and takes in the next where these are settled. At each:
+    up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
+    at once, for as long as there are ever fewer of them. Then steps that move one row each, as
+    the primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
+    Sherikov & Wieber 2015); with blocks = 0 it is that method, from x = 0. Ends after `steps` at
+    the latest; whether it found the optimum is for the certificate to say.
+
+    Returns x (n,), the multipliers (M, p + 1) that should prove it, rank (p,), and the steps made.
+    """
+    if act.shape != rows.lower.shape or act.dtype != np.int8:
+        raise InputError(f"an active set must be {rows.lower.shape} int8; got {act.shape} {act.dtype}")
+    return _search(
+        rows.A,
+        rows.lower,
+        rows.upper,
+        rows.offsets,
+        act,
+        rows.frobenius,
+        rows.row_norm,
+        rows.floor,
+        first,
+        blocks,
+        steps,
+    )
+
+
+def work_of_a_step(rows: Stacked) -> int:
+    """Multiply-adds of one step of `search`, roughly."""
+    M, n = rows.A.shape
+    return M * n * (n + len(rows.frobenius)) + 1

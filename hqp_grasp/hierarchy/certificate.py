@@ -8,8 +8,6 @@ the best multipliers there are, by non-negative least squares.
 
 from __future__ import annotations
 
-from decimal import Decimal, localcontext
-
 import numpy as np
 from numba import njit
 from scipy.optimize import nnls
@@ -18,8 +16,7 @@ EPS = float(np.finfo(float).eps)
 VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
 SIGN_PASSES = 8  # rounds of mending signs before the least-squares search is asked
 SMALL = 1e-11  # [–] of the largest pull: what is left of it on another unknown by rounding
-DIGITS = 80
-WEAK = 1e-3  # [–] of a row: with less of its own it makes the span uncertain
+NNLS_ROUNDS = 3  # for each row, before the search for multipliers is given up
 LEAN = 1e8  # [–] a level's proof is not added to another's more often than this
 ROUNDING = 1e-13  # [–] of the terms that make up an imbalance; below it, it counts as none,
 # unless they are huge: next to them any pull is small, and by such terms it could be balanced
@@ -59,7 +56,7 @@ def measure(A, lower, upper, off, rank_tolerance):
 
 
 @njit(cache=True, error_model="numpy")
-def check(A, lower, upper, off, x, lam, tol, rank_tolerance, least_norm):
+def check(A, lower, upper, off, x, lam, tol, row_norm, frobenius, floor, least_norm):
     """Residuals, and which columns of `lam` (M, p or p + 1) fail to prove their level optimal.
 
     A level may leave what is below its rank floor. With least_norm, column
@@ -73,7 +70,6 @@ def check(A, lower, upper, off, x, lam, tol, rank_tolerance, least_norm):
     M, n = A.shape
     p = len(off) - 1
     columns = p + 1 if least_norm else p
-    row_norm, frobenius, floor = measure(A, lower, upper, off, rank_tolerance)
     w = np.empty(M)
     pull = np.empty(M)  # w as it is: what counts as met may still balance the others
     nearest = np.empty(M)
@@ -202,22 +198,25 @@ def optimality_faults(
     x: np.ndarray,
     multipliers: np.ndarray,
     tol: float,
-    rank_tolerance: float = -1.0,
-    least_norm: bool = False,
-) -> tuple[np.ndarray, np.ndarray, dict[int, str]]:
+    row_norm: np.ndarray,
+    frobenius: np.ndarray,
+    floor: np.ndarray,
+    least_norm: bool,
+) -> tuple[np.ndarray, np.ndarray, dict[int, tuple[float, str]]]:
     """Residuals w (M,), levels that have some (p,), and what keeps x from being certified.
 
-    That is said for each level at fault, and for p where x is not shown to be the shortest.
+    That is said for each level at fault, and for p where x is not shown to be the shortest: how
+    many times the imbalance is what may be left, and in words.
     """
     every, w, missed, pull, push, proven, scale = check(
-        A, lower, upper, off, x, multipliers, tol, rank_tolerance, least_norm
+        A, lower, upper, off, x, multipliers, tol, row_norm, frobenius, floor, least_norm
     )
-    faults: dict[int, str] = {}
+    faults: dict[int, tuple[float, str]] = {}
     if every:
         return w, missed, faults
     if not np.isfinite(x).all():
-        return w, missed, {0: "x is not finite"}
-    for k in np.flatnonzero(~proven):
+        return w, missed, {0: (np.inf, "x is not finite")}
+    for k in np.flatnonzero(~proven).tolist():
         last = k == len(off) - 1
         above = slice(0, off[k])
         own = slice(off[k], off[k + 1]) if not last else slice(0, 0)
@@ -225,7 +224,7 @@ def optimality_faults(
         rest = _least_imbalance(force, A[above], push[above], scale[:, k])
         if not rest <= 1.0:
             name = "least norm of x" if last else f"level {k}"
-            faults[int(k)] = f"{name}: imbalance is {rest:.1e} of what counts as none"
+            faults[k] = rest, f"{name}: imbalance is {rest:.1e} of what counts as none"
     return w, missed, faults
 
 
@@ -233,82 +232,30 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: n
     """Largest entry of (pull + Aᵀ λ) / scale for the best λ in the least-squares sense.
 
     λ is free where push is 2, of push's sign where ±1, and 0 where push is 0. What the free rows
-    can balance is taken out first, in many digits where double precision does not do: rows that
-    are nearly parallel balance with multipliers whose last digit is already too coarse.
+    can balance is taken out first.
     """
     if not pull.any():
         return 0.0
     size = np.maximum(scale, SMALL * np.abs(pull).max())
-    free, signed = A[push == 2], np.concatenate([A[push == 1], -A[push == -1]])
-    for without in (_without, _without_in_many_digits):
-        rest, rows, weakest = without(free, pull, signed, size)
-        length = float(np.linalg.norm(rest))
-        if length > 0.0 and len(rows):
-            try:
-                best, _ = nnls(rows.T, -rest / length, maxiter=30 * (1 + len(rows)))
-            except RuntimeError:  # it did not converge: these rows are not shown to balance
-                best = np.zeros(len(rows))
-            rest = rest + length * (rows.T @ best)
-        lost = min(LOST, EVALUATED / max(weakest, EPS)) * np.abs(pull / size).max()
-        imbalance = float(np.abs(rest).max()) / max(1.0, lost)
-        if imbalance <= 1.0:
-            break
-    return imbalance
-
-
-def _without(
-    free: np.ndarray, pull: np.ndarray, signed: np.ndarray, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """pull / size and the directions of signed / size without what lies in span(free / size).
-
-    And how weak the weakest combination of the free rows is, each of length 1; 1 if not looked for.
-    """
-    rest, rows = pull / size, _directions(signed / size)
-    free = _directions(free / size)
+    rest = pull / size
+    rows = _directions(np.concatenate([A[push == 1], -A[push == -1]]) / size)
+    free = _directions(A[push == 2] / size)
     if len(free):
         _, sigma, Vt = np.linalg.svd(free, full_matrices=False)
         basis = Vt[sigma > EPS * max(free.shape) * sigma[0]]
         for _ in range(2):
             rest = rest - basis.T @ (basis @ rest)
             rows = rows - (rows @ basis.T) @ basis
-    return rest, rows, 1.0
-
-
-def _without_in_many_digits(
-    free: np.ndarray, pull: np.ndarray, signed: np.ndarray, size: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """The same as `_without`, by Gram–Schmidt on decimals."""
-    with localcontext() as context:
-        context.prec = DIGITS
-        unit = decimals(size)
-        rest, rows = decimals(pull) / unit, decimals(signed) / unit
-        left = decimals(free) / unit
-        for group in (rows, left):
-            for row in group:
-                row /= (row @ row).sqrt() or 1
-        basis: list[np.ndarray] = []
-        weakest = 1.0
-        for q in left:  # in the order of the levels, as ranks are told
-            for _ in range(2):
-                for known in basis:
-                    q = q - (q @ known) * known
-            norm = (q @ q).sqrt()
-            if norm > EPS * len(basis):
-                q = q / norm
-                basis.append(q)
-                weakest *= float(norm) if norm < WEAK else 1.0
-                rest = rest - (rest @ q) * q
-                rows = rows - np.outer(rows @ q, q)
-        return rest.astype(float), rows.astype(float), weakest
+    length = float(np.linalg.norm(rest))
+    if length > 0.0 and len(rows):
+        try:
+            best, _ = nnls(rows.T, -rest / length, maxiter=NNLS_ROUNDS * len(rows))
+        except RuntimeError:  # it did not converge: these rows are not shown to balance
+            best = np.zeros(len(rows))
+        rest = rest + length * (rows.T @ best)
+    return float(np.abs(rest).max())
 
 
 def _directions(rows: np.ndarray) -> np.ndarray:
     norm = np.linalg.norm(rows, axis=1)
     return rows[norm > 0.0] / norm[norm > 0.0, None]
-
-
-def decimals(values: np.ndarray) -> np.ndarray:
-    """`values` as decimal numbers, exactly."""
-    return np.array([Decimal(v) for v in values.ravel().tolist()], dtype=object).reshape(
-        values.shape
-    )

@@ -7,29 +7,26 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-from numba import njit, types
+from numba import njit
 
 from hqp_grasp.errors import InputError
-from hqp_grasp.hierarchy.certificate import optimality_faults
+from hqp_grasp.hierarchy.certificate import measure, optimality_faults
 
 CERTIFICATE_TOLERANCE = 1e-8  # [–] row-scaled; what `is_optimal` asks unless told otherwise
 
 
 def _floats(name: str, value: object, ndim: int) -> np.ndarray:
+    """A copy of `value`: what the caller does to it later, as mj_jacSite does, changes no level."""
     try:
-        array = np.asarray(value, dtype=float)
+        array = np.array(value, dtype=float, order="C")
     except (TypeError, ValueError) as error:
         raise InputError(f"Level.{name} must be an array of numbers; got {value!r}") from error
     if array.ndim != ndim:
         raise InputError(f"Level.{name} must have {ndim} dimension(s); got shape {array.shape}")
-    return array if array.flags.aligned else array.copy()
+    return array
 
 
-_VECTOR = types.Array(types.float64, 1, "A", readonly=True)  # any strides, never written to
-_MATRIX = types.Array(types.float64, 2, "A", readonly=True)
-
-
-@njit(types.boolean(_MATRIX, _VECTOR, _VECTOR), cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _constructs(A, lower, upper):  # type: ignore[no-untyped-def]
     """Whether all is as `Level` asks; NaN compares false."""
     m, n = A.shape
@@ -47,6 +44,8 @@ class Level:
     """Rows lower ≤ A x ≤ upper of one priority level, met in the least-squares sense.
 
     Rows that contradict one another are no error: the level is resolved to its nearest point.
+    The arrays are copied and locked, so that a level is a value whatever becomes of the buffers it
+    was built from. Copies and checks take some 2 µs (`benchmarks/where_time_goes.py`).
     Raises InputError, naming the row, where A is not finite, a bound is NaN, lower > upper,
     lower = +inf or upper = −inf.
     """
@@ -67,9 +66,9 @@ class Level:
             )
         if not _constructs(A, lower, upper):
             raise self._fault(A, lower, upper)
-        object.__setattr__(self, "A", A)
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
+        for field, array in (("A", A), ("lower", lower), ("upper", upper)):
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
 
     def _fault(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> InputError:
         """What keeps the first faulty row from being one."""
@@ -122,39 +121,33 @@ class Solution:
     x: np.ndarray  # (n,)
     levels: tuple[LevelReport, ...]
     active: np.ndarray  # (M,) int8 per stacked row: −1 at lower, +1 at upper, 2 equality, 0 free
-    multipliers: np.ndarray  # (M, p + 1): column k proves level k, the last that x is the shortest;
-    # 0 where found with many digits: there the certificate finds its own
-    method: str  # the way that found x
-    failed: tuple[str, ...] = ()  # ways tried before whose answers failed the certificate
-    rank_tolerance: float = -1.0  # [–] the user's, < 0 for the default rule
+    multipliers: np.ndarray  # (M, p + 1): column k proves level k, the last that x is the shortest
+    method: str  # what found x: a name of `solvers()`, "one row at a time", "projection", …
+    failed: tuple[str, ...] = ()  # what was tried before, or fell short, and why
+    certified: bool = False  # shown to be optimal; else the best effort within the budget
+    rank_tolerance: float | None = None  # [–] the solver's; None: the default rule
 
     @property
     def limit_active(self) -> bool:
         """True where some inequality row holds x at a bound."""
         return bool((np.abs(self.active) == 1).any())
 
-    def is_optimal(self, levels: Sequence[Level], tol: float = CERTIFICATE_TOLERANCE) -> bool:
+    def is_optimal(
+        self, levels: Level | Sequence[Level], tol: float = CERTIFICATE_TOLERANCE
+    ) -> bool:
         """True where x is the lexicographic least-squares optimum of `levels`, to `tol`.
 
         Level k is optimal, given those above, when −A_kᵀ w_k is a combination of the rows above
         that hold x: of either sign for equalities and rows that cannot be met, pushing inwards
         for rows at a bound. Where the multipliers at hand do not show it, others are searched by
-        non-negative least squares (degenerate active sets have many); no QP solver takes part.
-        With a rank tolerance of the user's, a level may leave what lies in directions weaker than
-        that.
+        non-negative least squares (degenerate active sets have many). No solver takes part.
+        What lies below the rank tolerance is asked for by no level.
+
+        Raises InputError where `levels` are not of the size of this solution.
         """
-        rows = stack(levels)
-        _, _, faults = optimality_faults(
-            rows.A,
-            rows.lower,
-            rows.upper,
-            rows.offsets,
-            self.x,
-            self.multipliers,
-            tol,
-            self.rank_tolerance,
-        )
-        return not faults
+        return not optimality(
+            stack(levels, self.rank_tolerance), self.x, self.multipliers, tol
+        ).faults
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,18 +158,75 @@ class Stacked:
     lower: np.ndarray  # (M,)
     upper: np.ndarray  # (M,)
     offsets: np.ndarray  # (p + 1,) level k owns rows offsets[k]:offsets[k+1]
+    row_norm: np.ndarray  # (M,)
+    frobenius: np.ndarray  # (p,) ‖A_k‖_F
+    floor: np.ndarray  # (p,) rank tolerance × ‖A_k‖_F: what a level asks for by less is not asked
 
 
-def stack(levels: Sequence[Level]) -> Stacked:
-    """Stack levels; raise InputError where they disagree on the number of unknowns."""
-    if not levels:
-        raise InputError("a hierarchy needs at least one level")
+def stack(levels: Level | Sequence[Level], rank_tolerance: float | None = None) -> Stacked:
+    """Stack levels; raise InputError for what is none, or where the numbers of unknowns differ."""
+    if isinstance(levels, Level):
+        levels = [levels]
     try:
+        if not levels:
+            raise InputError("a hierarchy needs at least one level")
         A = np.concatenate([level.A for level in levels])
+        lower = np.concatenate([level.lower for level in levels])
+        upper = np.concatenate([level.upper for level in levels])
+    except (TypeError, AttributeError) as error:
+        raise InputError(f"levels must be hg.Level objects, first level first; {error}") from error
     except ValueError as error:
+        if isinstance(error, InputError):
+            raise
         widths = [level.A.shape[1] for level in levels]
         raise InputError(f"levels disagree on the number of unknowns: {widths}") from error
-    lower = np.concatenate([level.lower for level in levels])
-    upper = np.concatenate([level.upper for level in levels])
     offsets = np.array([0, *accumulate(len(level.lower) for level in levels)])
-    return Stacked(A, lower, upper, offsets)
+    tolerance = -1.0 if rank_tolerance is None else rank_tolerance
+    return Stacked(A, lower, upper, offsets, *measure(A, lower, upper, offsets, tolerance))
+
+
+@dataclass(frozen=True)
+class Optimality:
+    """What the certificate says about an x."""
+
+    residual: np.ndarray  # (M,) 0 where it is rounding
+    missed: np.ndarray  # (p,) levels with a residual
+    faults: dict[int, tuple[float, str]]  # by level, p: shortness; imbalance [–] above 1, and words
+
+
+def optimality(
+    rows: Stacked,
+    x: np.ndarray,
+    multipliers: np.ndarray,
+    tol: float = CERTIFICATE_TOLERANCE,
+    shortest: bool = False,
+) -> Optimality:
+    """Judge x: the checked door to the compiled certificate.
+
+    `shortest` asks whether x is also the shortest optimum; multipliers then need p + 1 columns.
+    Raises InputError where x or multipliers are not of the size of the levels.
+    """
+    M, n = rows.A.shape
+    columns = len(rows.frobenius) + shortest
+    if x.shape != (n,):
+        raise InputError(f"levels have {n} unknowns; the solution's x has shape {x.shape}")
+    if multipliers.ndim != 2 or len(multipliers) != M or multipliers.shape[1] < columns:
+        raise InputError(
+            f"levels of {M} rows need multipliers ({M}, {columns}); "
+            f"the solution's have shape {multipliers.shape}"
+        )
+    return Optimality(
+        *optimality_faults(
+            rows.A,
+            rows.lower,
+            rows.upper,
+            rows.offsets,
+            x,
+            multipliers,
+            tol,
+            rows.row_norm,
+            rows.frobenius,
+            rows.floor,
+            shortest,
+        )
+    )
