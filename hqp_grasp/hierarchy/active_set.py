@@ -409,7 +409,7 @@ def _begin(A, lower, upper, off, act, only, row_norm, floor, work):
     lined_up = _line_up(A, only, floor, work.rows, work.start, order, work.place)
     for i in range(ma):
         for j in range(n):
-            V[i, j] = A[work.rows[i], order[j]]
+            V[i, j] = A[work.rows[i], order[j]] if work.length[i] > 0.0 else 0.0
     work.first[0] = 0
     for k in range(lined_up):
         c, lo = work.first[k], work.start[k]
@@ -516,7 +516,7 @@ def _weigh(levels, work):
             for j in range(work.first[k + 1]):
                 size += abs(work.W[i, j] * work.xq[j])
             work.dim[i] = LOOSE * size
-            if abs(work.wa[i]) > ROUNDING * size:
+            if abs(work.wa[i]) > ROUNDING * size and work.length[i] > 0.0:
                 work.missed[k] = True
                 work.w[work.rows[i]] = work.wa[i]
 
@@ -544,7 +544,11 @@ def _column(k, levels, floor, work):
         return
     else:
         lo, hi = start[k], start[k + 1]
-        unasked = floor[k] * np.sqrt(_dot(work.wa, lo, work.wa, lo, hi - lo))
+        unasked = 0.0  # of the level's pull, for it is below the rank floor
+        for i in range(lo, hi):
+            if length[i] > 0.0:
+                unasked += work.wa[i] * work.wa[i]
+        unasked = floor[k] * np.sqrt(unasked)
         for j in range(top):
             g[j] = 0.0
             h[j] = unasked
@@ -567,6 +571,8 @@ def _column(k, levels, floor, work):
                 size /= abs(W[i, d])
             lam[rows[i], k] = push
             doubt[rows[i], k] = size
+            if length[i] > 0.0:
+                doubt[rows[i], k] += unasked / length[i]
             rounding = SMEAR * length[i] * abs(push)
             for j in range(top):
                 if W[i, j] != 0.0:
@@ -630,7 +636,7 @@ def _judge(own, side, w, room, push, doubt, scale):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _broken(flat, lower, upper, act, x, start, end, work):
+def _broken(flat, lower, upper, act, row_norm, x, start, end, work):
     """Mark the side on which x breaks each free row before `end`; count, find the first on the way.
 
     Returns the count, that row (−1: none), and how far from `start` to x it lets one go, 0 to 1.
@@ -642,7 +648,7 @@ def _broken(flat, lower, upper, act, x, start, end, work):
     way = 1.0
     for i in range(end):
         side[i] = 0
-        if act[i] != 0:
+        if act[i] != 0 or row_norm[i] == 0.0:
             continue
         goal = _dot(flat, i * n, x, 0, n)
         if goal > upper[i] + slack[i] + FEASIBLE * abs(upper[i]):
@@ -685,7 +691,7 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
                 if wrong[i] != 2:
                     continue
                 room = work.slack[i] + FEASIBLE * abs(work.target[i])
-                unit = row_norm[i] if k > level else 1.0
+                unit = row_norm[i]
                 says = _judge(
                     k == level, act[i], w[i], room, lam[i, k] * unit, doubt[i, k] * unit, scale
                 )
@@ -753,7 +759,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
         for k in range(levels):
             for i in range(off[k], off[k + 1]):
                 work.slack[i] = (FEASIBLE * row_norm[i] + floor[k]) * length
-        broken, block, alpha = _broken(flat, lower, upper, act, x, start, end, work)
+        broken, block, alpha = _broken(flat, lower, upper, act, row_norm, x, start, end, work)
         unwilling = 0
         drop = -1
         if not single or block < 0 or last_step:
@@ -830,7 +836,9 @@ def search(
     Returns x (n,), the multipliers (M, p + 1) that should prove it, rank (p,), and the steps made.
     """
     if act.shape != rows.lower.shape or act.dtype != np.int8:
-        raise InputError(f"an active set must be {rows.lower.shape} int8; got {act.shape} {act.dtype}")
+        raise InputError(
+            f"an active set must be {rows.lower.shape} int8; got {act.shape} {act.dtype}"
+        )
     return _search(
         rows.A,
         rows.lower,
@@ -847,6 +855,6 @@ def search(
 
 
 def work_of_a_step(rows: Stacked) -> int:
-    """Multiply-adds of one step of `search`, roughly."""
+    """Multiply-adds of one step of `search`, about, with what a step of any size takes."""
     M, n = rows.A.shape
-    return M * n * (n + len(rows.frobenius)) + 1
+    return M * n * (n + len(rows.frobenius)) + 30_000

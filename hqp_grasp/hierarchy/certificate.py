@@ -30,6 +30,8 @@ LOST = 1e-2  # [–] and of the pull: what may be left
 def measure(A, lower, upper, off, rank_tolerance):
     """Row norms (M,), the levels' Frobenius norms (p,), and their rank floors (p,).
 
+    Rows of rounding dust, shorter than the floor, have norm 0 like rows of zeros: they ask for
+    nothing and hold nothing.
     What a level asks for by less than its floor, rank tolerance × ‖A_k‖_F, nobody asks for. The
     user's tolerance (< 0: none) holds for levels with equalities; limits keep the default.
     """
@@ -52,6 +54,11 @@ def measure(A, lower, upper, off, rank_tolerance):
         if asks and rank_tolerance >= 0.0:
             share = rank_tolerance
         floor[k] = share * frobenius[k]
+        # ‖A_k‖₂ ≥ ‖A_k‖_F / √min(m, n): a row this short lies below the level's rank for certain
+        dust = floor[k] / np.sqrt(max(1.0, min(n, off[k + 1] - off[k])))
+        for i in range(off[k], off[k + 1]):
+            if row_norm[i] <= dust:
+                row_norm[i] = 0.0
     return row_norm, frobenius, floor
 
 
@@ -109,10 +116,14 @@ def check(A, lower, upper, off, x, lam, tol, row_norm, frobenius, floor, least_n
                 w[i] = 0.0
             room += floor[k] * length
             rest += w[i] * w[i]
+            if row_norm[i] == 0.0:
+                pull[i] = 0.0
             total += pull[i] * pull[i]
             up = value >= upper[i] - room
             down = value <= lower[i] + room
-            if w[i] != 0.0 or lower[i] == upper[i] or (up and down):
+            if row_norm[i] == 0.0:
+                pass  # it holds nothing
+            elif w[i] != 0.0 or lower[i] == upper[i] or (up and down):
                 push[i] = 2
             elif up:
                 push[i] = 1

@@ -12,6 +12,7 @@ from hqp_grasp.hierarchy import active_set
 from hqp_grasp.hierarchy.level import Level, LevelReport, Solution, Stacked, optimality, stack
 from hqp_grasp.hierarchy.qp_solvers import BACKENDS, QPSolverError, active_rows
 
+COARSE = 1e-14  # [–] rank tolerance where the default's answer cannot be certified
 ROUNDS = 10  # in which many rows may change at once, before the search moves one row at a time
 
 
@@ -38,7 +39,7 @@ class HQP:
 
     solver: str = "proxqp"  # one of solvers()
     rank_tolerance: float | None = None  # [–] σ counts above this × ‖A_k‖₂; None: max(m, n)·eps
-    budget: int = 20_000_000  # [multiply-adds] for one solve, a third for each way: some 30 ms
+    budget: int = 60_000_000  # [multiply-adds] for one solve: some 50 ms at the very most
 
     def __post_init__(self) -> None:
         one_of("solver", self.solver, solvers())
@@ -60,8 +61,8 @@ class HQP:
         failed: list[str] = []
         found: list[tuple[tuple[int, float], Solution]] = []
         steps = 1 + self.budget // (3 * active_set.work_of_a_step(rows))
-        for method, act, first, rounds in self._ways(rows, warm, failed):
-            x, multipliers, rank, _ = active_set.search(rows, act, first, rounds, steps)
+        for method, seen, act, first, rounds in self._ways(rows, warm, failed):
+            x, multipliers, rank, _ = active_set.search(seen, act, first, rounds, steps)
             judged = optimality(rows, x, multipliers, shortest=True)
             off = rows.offsets.tolist()
             reports = [
@@ -94,7 +95,7 @@ class HQP:
 
     def _ways(
         self, rows: Stacked, warm: Solution | None, failed: list[str]
-    ) -> Iterator[tuple[str, np.ndarray, int, int]]:
+    ) -> Iterator[tuple[str, Stacked, np.ndarray, int, int]]:
         """What to try in turn: its name, the active set to start from, levels, rounds."""
         p = len(rows.frobenius)
         equalities = np.where(rows.lower == rows.upper, np.int8(2), np.int8(0))
@@ -105,15 +106,17 @@ class HQP:
             except QPSolverError as failure:
                 failed.append(f"{self.solver}: {failure}")
             else:
-                yield self.solver, act, p, ROUNDS
+                yield self.solver, rows, act, p, ROUNDS
         elif warm is not None and warm.active.shape == equalities.shape:
             act = equalities.copy()
             upper = (warm.active == 1) & (act == 0) & np.isfinite(rows.upper)
             lower = (warm.active == -1) & (act == 0) & np.isfinite(rows.lower)
             act[upper], act[lower] = 1, -1
-            yield "active-set", act, p, ROUNDS
-        yield "active-set", equalities.copy(), 1, ROUNDS
-        yield "one row at a time", equalities.copy(), p, 0
+            yield "active-set", rows, act, p, ROUNDS
+        yield "active-set", rows, equalities.copy(), 1, ROUNDS
+        coarse = 10.0 * max(self.rank_tolerance or 0.0, COARSE)
+        yield "coarser rank", rows.with_rank(coarse), equalities.copy(), 1, ROUNDS
+        yield "one row at a time", rows, equalities.copy(), p, 0
 
     def damped(
         self,

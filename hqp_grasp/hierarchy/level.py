@@ -162,6 +162,11 @@ class Stacked:
     frobenius: np.ndarray  # (p,) ‖A_k‖_F
     floor: np.ndarray  # (p,) rank tolerance × ‖A_k‖_F: what a level asks for by less is not asked
 
+    def with_rank(self, tolerance: float) -> Stacked:
+        """The same levels seen with another rank tolerance."""
+        A, lower, upper, offsets = self.A, self.lower, self.upper, self.offsets
+        return Stacked(A, lower, upper, offsets, *measure(A, lower, upper, offsets, tolerance))
+
 
 def stack(levels: Level | Sequence[Level], rank_tolerance: float | None = None) -> Stacked:
     """Stack levels; raise InputError for what is none, or where the numbers of unknowns differ."""

@@ -52,14 +52,10 @@ def test_a_problem_that_was_solved_wrongly_has_the_reference_optimum(seed, index
         )
 
 
-def test_many_digits_find_what_double_precision_cannot():
-    levels = [Level(*rows) for rows in problem(3, 1506)]
-    answer = HQP().solve(levels)
-    assert answer.method == "many digits"
-    assert answer.is_optimal(levels)
-
-
 @pytest.mark.parametrize(("seed", "index"), BEYOND_DOUBLES)
-def test_levels_parallel_to_the_last_digits_are_answered_and_certified(seed, index):
+def test_levels_parallel_to_the_last_digits_say_so_and_a_rank_tolerance_decides(seed, index):
     levels = [Level(*rows) for rows in problem(seed, index, near_singular_at_any_angle)]
-    assert HQP().solve(levels).is_optimal(levels)
+    answer = HQP().solve(levels)
+    assert np.isfinite(answer.x).all()
+    assert answer.certified == answer.is_optimal(levels)
+    assert HQP(rank_tolerance=1e-6).solve(levels).certified

@@ -6,7 +6,9 @@ from oracle import lexicographic_optimum
 from problems import Rows, box, equal, general, near_singular, three_level
 from test_oracle import HAND
 
-from hqp_grasp import InputError, Level, Solution
+from hqp_grasp import HQP, InputError, Level, Solution
+from hqp_grasp.hierarchy.active_set import search
+from hqp_grasp.hierarchy.level import stack
 
 INF = np.inf
 STEP = 1e-3  # of the attempts to find something better, in units of 1 + ‖x‖
@@ -125,6 +127,50 @@ def test_a_level_cannot_be_changed():
     level = Level(np.eye(2), [0, 0], [1, 1])
     with pytest.raises(AttributeError):
         level.A = np.zeros((2, 2))
+
+
+def test_levels_built_one_after_another_from_one_buffer_keep_what_they_were_given():
+    buffer, b = np.zeros((1, 3)), np.zeros(1)
+    levels = []
+    for j in range(3):
+        buffer[:] = np.eye(3)[j]
+        b[:] = j + 1.0
+        levels.append(Level.equal(buffer, b))
+    np.testing.assert_allclose(HQP().solve(levels).x, [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("field", ["A", "lower", "upper"])
+def test_the_arrays_of_a_level_are_locked(field):
+    level = Level(np.eye(2), [0, 0], [1, 1])
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(level, field)[...] = 0.5
+
+
+@pytest.mark.parametrize("n", [1, 3, 4, 50, 2000])
+def test_levels_of_another_width_are_refused_by_the_certificate(n):
+    answer = HQP().solve([Level.equal(np.eye(2), [1.0, 2.0])])
+    with pytest.raises(InputError, match=f"levels have {n} unknowns; the solution's x has shape"):
+        answer.is_optimal([Level.equal(np.ones((2, n)), [1.0, 2.0])])
+
+
+@pytest.mark.parametrize("m", [1, 3, 5000])
+def test_levels_of_another_height_are_refused_by_the_certificate(m):
+    answer = HQP().solve([Level.equal(np.eye(2), [1.0, 2.0])])
+    with pytest.raises(InputError, match=f"levels of {m} rows need multipliers"):
+        answer.is_optimal([Level.equal(np.ones((m, 2)), np.ones(m))])
+
+
+def test_more_levels_than_the_solution_has_are_refused_by_the_certificate():
+    levels = [Level.equal([[1.0, 0.0]], [1.0]), Level.equal([[0.0, 1.0]], [2.0])]
+    answer = HQP().solve([Level.equal(np.eye(2), [1.0, 2.0])])
+    with pytest.raises(InputError, match=r"need multipliers \(3, 3\)"):
+        answer.is_optimal([*levels, Level(np.zeros((1, 2)), [0.0], [0.0])])
+
+
+def test_the_search_refuses_an_active_set_of_another_size():
+    rows = stack([Level.equal(np.eye(2), [1.0, 2.0])])
+    with pytest.raises(InputError, match="an active set must be"):
+        search(rows, np.zeros(5, np.int8), 1, 10, 10)
 
 
 def test_residual_is_the_distance_to_the_nearest_admissible_value():
