@@ -23,7 +23,7 @@ def solve_ik(
     configuration: mink.Configuration,
     priorities: Sequence[Tasks],
     dt: float,
-    solver: str = "proxqp",
+    solver: str = "active-set",
     damping: float = 0.0,
     safety_break: bool = False,
     limits: Sequence[mink.Limit] | None = None,
@@ -34,6 +34,7 @@ def solve_ik(
     The arguments of mink.solve_ik in its order, with lists of tasks in the place of tasks; what
     each means is said at `ik_levels`. Nothing is infeasible: what cannot be met is met as nearly
     as the levels above allow. HQP(solver).solve(ik_levels(…)) tells which, and by how much.
+    The compiled search answers unless another solver is named: it is the fastest, and exact.
 
     Raises InputError for malformed arguments, and with `safety_break`, as mink does,
     mink.NotWithinConfigurationLimits for a start outside the joint ranges.
@@ -87,7 +88,7 @@ def ik_levels(
         W, e, mu = _rows(tasks, configuration)
         levels.append(Level.equal(W, e, " + ".join(type(task).__name__ for task in tasks)))
         dampings.append(mu + damping)
-    return (hqp or HQP()).damped(levels, dampings) if any(dampings) else levels
+    return (hqp or HQP("active-set")).damped(levels, dampings) if any(dampings) else levels
 
 
 def _priority(limit: mink.Limit) -> Priority:

@@ -1,4 +1,4 @@
-"""Tells the terminal, once, that the solver is being compiled: some seconds of silence otherwise."""
+"""Says on the terminal, once, that the solver is being compiled: it would be silent for long."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ With y (d,) the freedom left, x = x₀ + Z y, and slacks s for the level's own i
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Callable
 
 import daqp
@@ -319,7 +320,9 @@ def _through_qpsolvers(name: str) -> Backend:
         if name not in qpsolvers.dense_solvers:
             P, sides = csc_matrix(P), csc_matrix(sides)
         problem = qpsolvers.Problem(P, q, sides, bounds) if len(bounds) else qpsolvers.Problem(P, q)
-        answer = qpsolvers.solve_problem(problem, name)
+        with warnings.catch_warnings():  # of how qpsolvers calls others nobody here can do anything
+            warnings.simplefilter("ignore", PendingDeprecationWarning)
+            answer = qpsolvers.solve_problem(problem, name)
         if not answer.found or answer.x is None:
             raise QPSolverError("no solution found")
         z = np.zeros(len(G))

@@ -27,7 +27,7 @@ def built(problem):
 def hierarchy(problem, solver="proxqp", **options):
     """The hierarchy's answer, through the QP solver and nothing else."""
     levels = built(problem)
-    answer = HQP(solver=solver, shortcuts=False, **options).solve(levels)
+    answer = HQP(solver=solver, **options).solve(levels)
     assert answer.is_optimal(levels)
     return answer
 
@@ -319,7 +319,7 @@ def serves_at_least_as_well(levels, x, other):
 def test_on_grasps_felt_the_forms_agree_unless_a_limit_holds_and_then_none_is_better(
     cap, tight, solver, probe
 ):
-    hqp = HQP(solver, rank_tolerance=TOUCH_RANK, shortcuts=False)
+    hqp = HQP(solver, rank_tolerance=TOUCH_RANK)
     ranges = hg.ConfigurationLimit(cylinder.scene.articulated)
     stack = hg.stack_of("fmk").within(cap, ranges)
     agreed = held = 0
