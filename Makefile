@@ -84,7 +84,7 @@ results: $(READY_BENCH)
 	$(call cylinder,no-landing,--probes 40 --seed 0 --no-landing)
 	$(call cylinder,clipped,--probes 40 --seed 0 --form clipped)
 	$(call cylinder,paper,--probes 60 --seed 0 --form paper)
-	$(call cylinder,links-block,--probes 40 --seed 0 --links block)
+	$(call cylinder,links-pass,--probes 40 --seed 0 --links pass)
 	cp $(RESULTS)/cylinder-0/convergence.png docs/images/cylinder-convergence.png
 	$(call keep,probing,benchmarks/probing.py)
 	$(call keep,limits,benchmarks/limits.py)
