@@ -6,7 +6,8 @@
 Every method answers the same rows (tests/problems.py), in one run: they take turns, in a random
 order, at blocks of problems. What is timed:
 
-    HQP         levels built from arrays, solved from cold, certified
+    HQP         levels built from arrays, solved from cold, certified; "named" is the share of the
+                answers that the solver of that name found
     hg.solve_ik the same by way of mink's tasks and limits, its own signature
     mink, pink  solve_ik with daqp: one QP, the tasks weighted by costs from 1e3 down to 1e-3.
                 The robot is a chain of hinges whose ranges are the box; tasks return the rows
@@ -57,24 +58,24 @@ WARM_UP = 3  # calls at the beginning of a block that are not counted
 REFERENCE = "mink"
 SIZES, SIZES_LEVELS = (6, 11, 16, 24, 32, 40, 50, 60), 4
 LEVELS, LEVELS_SIZE = (2, 3, 4, 5, 6, 7, 8), 20
-DRAWN = ("HQP proxqp", "HQP daqp", "mink", "pink", "daqp rotated", "projection")
+DRAWN = ("HQP proxqp", "HQP active-set", "mink", "pink", "daqp rotated", "projection")
 
 FAILURES = (mink.NoSolutionFound, hg.SolverError, ArithmeticError)  # to answer at all
 if pink is not None:
     FAILURES = (*FAILURES, pink.exceptions.NoSolutionFound)
 
 Problem = Sequence[Rows]  # a box over all unknowns, then equality rows
-Answer = tuple[np.ndarray, str]  # x, and the way it was found where the method says so
+Answer = tuple[np.ndarray, bool]  # x, and whether the solver asked for found it
 Method = Callable[[Problem], Callable[[], Answer]]  # what is done before the clock runs, and after
 
 
-def hierarchy(solver: str, shortcuts: bool) -> Method:
-    hqp = hg.HQP(solver, shortcuts=shortcuts)
+def hierarchy(solver: str) -> Method:
+    hqp = hg.HQP(solver)
 
     def prepare(problem: Problem) -> Callable[[], Answer]:
         def call() -> Answer:
             solution = hqp.solve([hg.Level(*rows) for rows in problem])
-            return solution.x, solution.method
+            return solution.x, solution.method == solver
 
         return call
 
@@ -112,14 +113,14 @@ def mink_robot(n: int) -> tuple[mink.Configuration, list[mink.Limit]]:
 def by_mink(problem: Problem) -> Callable[[], Answer]:
     configuration, limits = mink_robot(problem[0].A.shape[1])
     tasks = [MinkRows(r, c) for r, c in zip(problem[1:], costs(len(problem) - 1), strict=True)]
-    return lambda: (mink.solve_ik(configuration, tasks, 1.0, "daqp", limits=limits), "")
+    return lambda: (mink.solve_ik(configuration, tasks, 1.0, "daqp", limits=limits), True)
 
 
 def by_our_ik(solver: str) -> Method:
     def prepare(problem: Problem) -> Callable[[], Answer]:
         configuration, limits = mink_robot(problem[0].A.shape[1])
         tasks = [MinkRows(rows, 1.0) for rows in problem[1:]]
-        return lambda: (solve_ik(configuration, tasks, 1.0, solver, limits=limits), "")
+        return lambda: (solve_ik(configuration, tasks, 1.0, solver, limits=limits), True)
 
     return prepare
 
@@ -156,7 +157,7 @@ def pink_method() -> Method:
     def prepare(problem: Problem) -> Callable[[], Answer]:
         configuration, limits = robot(problem[0].A.shape[1])
         tasks = [PinkRows(r, c) for r, c in zip(problem[1:], costs(len(problem) - 1), strict=True)]
-        return lambda: (pink.solve_ik(configuration, tasks, 1.0, "daqp", limits=limits), "")
+        return lambda: (pink.solve_ik(configuration, tasks, 1.0, "daqp", limits=limits), True)
 
     return prepare
 
@@ -175,7 +176,7 @@ def by_daqp(problem: Problem) -> Callable[[], Answer]:
         )
         if flag < 1:
             raise ArithmeticError(f"exit flag {flag}")
-        return x, ""
+        return x, True
 
     return call
 
@@ -205,16 +206,15 @@ def by_daqp_rotated(problem: Problem) -> Callable[[], Answer]:
 
 def by_projection(problem: Problem) -> Callable[[], Answer]:
     form = hg.Projection()
-    return lambda: (form.solve([hg.Level(*rows) for rows in problem[1:]]).x, "")
+    return lambda: (form.solve([hg.Level(*rows) for rows in problem[1:]]).x, True)
 
 
 def methods() -> dict[str, Method]:
     """What is compared, by name."""
     chosen: dict[str, Method] = {}
-    for solver in ("proxqp", "daqp"):
-        chosen[f"HQP {solver}"] = hierarchy(solver, shortcuts=True)
-        chosen[f"HQP {solver}, no shortcuts"] = hierarchy(solver, shortcuts=False)
-        chosen[f"hg.solve_ik {solver}"] = by_our_ik(solver)
+    for solver in ("proxqp", "active-set", "daqp"):
+        chosen[f"HQP {solver}"] = hierarchy(solver)
+    chosen["hg.solve_ik"] = by_our_ik("active-set")
     chosen["mink"] = by_mink
     if pink is not None:
         chosen["pink"] = pink_method()
@@ -229,8 +229,7 @@ class Seen:
     """What one method did on one kind of problem."""
 
     times: list[float] = field(default_factory=list)  # [s]
-    backend: int = 0  # calls that reached the QP solver
-    says: bool = False  # whether the method says how it found its answers
+    named: int = 0  # answers that the solver asked for found
     failed: int = 0
     wrong: int = 0
 
@@ -268,7 +267,7 @@ def run_block(row: Seen, calls: list[Callable[[], Answer]], optima: list[np.ndar
     for i, call in enumerate([*calls[:WARM_UP], *calls], start=-min(WARM_UP, len(calls))):
         begin = time.perf_counter()
         try:
-            x, method = call()
+            x, named = call()
         except FAILURES:
             row.failed += i >= 0
             continue
@@ -276,8 +275,7 @@ def run_block(row: Seen, calls: list[Callable[[], Answer]], optima: list[np.ndar
         if i < 0:
             continue
         row.times.append(end - begin)
-        row.says = method != ""
-        row.backend += method not in ("", "shortcut")
+        row.named += named
         row.wrong += i < len(optima) and not np.abs(x - optima[i]).max() <= WRONG
     gc.enable()
 
@@ -287,16 +285,16 @@ def table(title: str, seen: dict[str, Seen], checked: int) -> None:
     print(f"\n{title}")
     print(
         f"{'':27}{'median':>8}{'ratio':>7}{'p99':>8}{'ratio':>7}{'p99/med':>9}"
-        f"{'backend':>9}{'wrong':>11}{'failed':>8}"
+        f"{'named':>9}{'wrong':>11}{'failed':>8}"
     )
     base = seen[REFERENCE]
     for name, row in seen.items():
         middle, late = row.percentile(50), row.percentile(99)
-        backend = f"{row.backend / max(1, len(row.times)):.1%}" if row.says else "–"
+        named = f"{row.named / max(1, len(row.times)):.1%}"
         print(
             f"{name:27}{middle:8.0f}{middle / base.percentile(50):7.2f}"
             f"{late:8.0f}{late / base.percentile(99):7.2f}{late / middle:9.1f}"
-            f"{backend:>9}{f'{row.wrong} of {checked}':>11}{row.failed:8}"
+            f"{named:>9}{f'{row.wrong} of {checked}':>11}{row.failed:8}"
         )
 
 

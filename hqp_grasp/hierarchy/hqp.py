@@ -98,11 +98,10 @@ class HQP:
     ) -> Iterator[tuple[str, Stacked, np.ndarray, int, int]]:
         """What to try in turn: its name, the active set to start from, levels, rounds."""
         p = len(rows.frobenius)
-        equalities = np.where(rows.lower == rows.upper, np.int8(2), np.int8(0))
+        equalities = 2 * (rows.lower == rows.upper).view(np.int8)
         if self.solver != "active-set":
-            iterations = 1 + self.budget // (30 * active_set.work_of_a_step(rows))
             try:
-                act = active_rows(rows, BACKENDS[self.solver], iterations)
+                act = active_rows(rows, BACKENDS[self.solver])
             except QPSolverError as failure:
                 failed.append(f"{self.solver}: {failure}")
             else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -150,8 +151,7 @@ class Solution:
         ).faults
 
 
-@dataclass(frozen=True, eq=False)
-class Stacked:
+class Stacked(NamedTuple):
     """All levels one above the other: the form in which solvers and certificate read them."""
 
     A: np.ndarray  # (M, n)
@@ -190,8 +190,7 @@ def stack(levels: Level | Sequence[Level], rank_tolerance: float | None = None) 
     return Stacked(A, lower, upper, offsets, *measure(A, lower, upper, offsets, tolerance))
 
 
-@dataclass(frozen=True)
-class Optimality:
+class Optimality(NamedTuple):
     """What the certificate says about an x."""
 
     residual: np.ndarray  # (M,) 0 where it is rounding

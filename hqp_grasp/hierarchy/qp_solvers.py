@@ -30,12 +30,13 @@ ACCURACY = 1e-6  # [–] asked of a solver; what it names is settled exactly aft
 AT_BOUND = 1e-5  # [–] scaled slack or dual above which a row holds x; well above ACCURACY
 RIDGE = 1e-9  # [–] added to the Hessian, of trace 1 or so: keeps y short where a level is silent
 SPANNED = 1e-9  # [–] of a row: with less left of it, the rows before it have taken its direction
+ITERATIONS = 25  # of proxqp, outer and in each: ten times what it takes where it converges
 INFINITE = 1e20  # what solvers take for no bound
 
 MET, HOLDS = 1, 2  # states of a row: an inequality that is met, a row that takes freedom away
 
 Backend = Callable[
-    [np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int],
+    [np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     tuple[np.ndarray, np.ndarray],
 ]
 
@@ -44,7 +45,7 @@ class QPSolverError(Exception):
     """A QP solver did not solve one level; the message says how it reported that."""
 
 
-def active_rows(rows: Stacked, backend: Backend, max_iter: int) -> np.ndarray:
+def active_rows(rows: Stacked, backend: Backend) -> np.ndarray:
     """The active set (M,) int8 that a QP solver finds: 2 equality, ±1 at a bound, 0 free.
 
     The first level and every level with inequalities above it, or of its own, goes to the solver;
@@ -65,7 +66,7 @@ def active_rows(rows: Stacked, backend: Backend, max_iter: int) -> np.ndarray:
             y, z = np.linalg.solve(P, -q), np.zeros(0)
         else:
             try:
-                y, z = backend(P, q, G, low, high, max_iter)
+                y, z = backend(P, q, G, low, high)
             # Solvers raise what they like, and qpsolvers passes it on; it is told in
             # Solution.failed.
             except Exception as error:
@@ -159,6 +160,9 @@ def _pose(A, lower, upper, off, unit, frobenius, state, x, Z, k):  # type: ignor
             G[c, d + own] = -1.0
             P[d + own, d + own] = (unit[i] / scale) ** 2
             size = max(size, low[c], -high[c])
+        else:  # met above, up to the solver's accuracy: y = 0 is allowed
+            low[c] = min(low[c], 0.0)
+            high[c] = max(high[c], 0.0)
     if size == 0.0 and asks:
         size = 1.0
     if size > 0.0:
@@ -207,8 +211,8 @@ def _take_in(A, lower, upper, off, unit, floor, state, act, x, Z, k, y, z, index
         state[i] = MET
         if lower[i] == upper[i]:
             state[i] = HOLDS
-        elif lower[i] == -np.inf and upper[i] == np.inf:
-            state[i] = 0
+        elif unit[i] == 0.0 or (lower[i] == -np.inf and upper[i] == np.inf):
+            state[i] = 0  # it asks for nothing
         elif abs(over) > AT_BOUND * unit[i] * length:
             act[i] = 1 if over > 0.0 else -1
             state[i] = HOLDS
@@ -263,7 +267,7 @@ _kept = threading.local()  # proxsuite's objects by shape: making one takes as l
 
 
 def _proxqp(
-    P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray, max_iter: int
+    P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     shape = G.shape
     kept = _kept.__dict__
@@ -273,9 +277,9 @@ def _proxqp(
         settings = qp.settings
         settings.initial_guess = proxsuite.proxqp.NO_INITIAL_GUESS  # y = 0: where the levels stand
         settings.eps_abs = ACCURACY
+        settings.max_iter = settings.max_iter_in = ITERATIONS
         settings.eps_rel = 0.0
         settings.eps_primal_inf = settings.eps_dual_inf = 1e-12  # defaults call some infeasible
-    qp.settings.max_iter = max_iter
     qp.init(
         P, q, None, None, G, np.maximum(lower, -INFINITE), np.minimum(upper, INFINITE), False
     )  # False: rows have length 1, there is nothing to scale
@@ -287,7 +291,7 @@ def _proxqp(
 
 
 def _daqp(
-    P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray, max_iter: int
+    P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     sense = np.zeros(len(G), dtype=np.int32)
     x, _, flag, info = daqp.solve(
@@ -298,7 +302,6 @@ def _daqp(
         np.maximum(lower, -INFINITE),
         sense,
         primal_tol=ACCURACY,
-        iter_limit=max_iter,
     )
     if flag < 1:
         raise QPSolverError(f"exit flag {flag}")
@@ -312,7 +315,6 @@ def _through_qpsolvers(name: str) -> Backend:
         G: np.ndarray,
         lower: np.ndarray,
         upper: np.ndarray,
-        max_iter: int,
     ) -> tuple[np.ndarray, np.ndarray]:
         has_upper, has_lower = np.isfinite(upper), np.isfinite(lower)
         sides = np.concatenate([G[has_upper], -G[has_lower]])

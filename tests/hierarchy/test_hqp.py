@@ -1,7 +1,6 @@
 """The hierarchy's answers: exact, certified, strict, whatever the solver and the problem."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -403,14 +402,14 @@ def test_an_answer_does_not_depend_on_what_was_solved_before():
 
 
 def raising(error):
-    def backend(P, q, G, lower, upper, max_iter):
+    def backend(P, q, G, lower, upper):
         raise error
 
     return backend
 
 
 def answering(value):
-    def backend(P, q, G, lower, upper, max_iter):
+    def backend(P, q, G, lower, upper):
         return np.full(len(q), value), np.full(len(G), value)
 
     return backend
@@ -455,7 +454,7 @@ def test_a_solver_that_answers_nonsense_does_no_harm(monkeypatch, value):
 def test_a_solver_that_answers_at_random_does_no_harm(monkeypatch):
     rng = np.random.default_rng(0)
 
-    def dice(P, q, G, lower, upper, max_iter):
+    def dice(P, q, G, lower, upper):
         return rng.standard_normal(len(q)), rng.standard_normal(len(G))
 
     monkeypatch.setitem(qp_solvers.BACKENDS, "daqp", dice)
@@ -611,7 +610,7 @@ def test_an_answer_that_is_not_shown_to_be_the_shortest_is_not_withheld(monkeypa
 
     def never_the_shortest(rows, *arguments, **options):
         found = judge(rows, *arguments, **options)
-        return replace(found, faults={**found.faults, 2: (9.0, "least norm of x: not shown")})
+        return found._replace(faults={**found.faults, 2: (9.0, "least norm of x: not shown")})
 
     monkeypatch.setattr(hqp_module, "optimality", never_the_shortest)
     levels = built([box(3, 1.0), equal([[1.0, 1.0, 1.0]], [1.5])])
