@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
@@ -62,10 +63,14 @@ class Settings:
     the paper."""
 
 
-def main(name: str, scene: Scene, settings: Settings | None = None) -> None:
-    """Run a scenario from the command line; what is wrong is said in one line."""
-    chosen = settings or tyro.cli(Settings, prog=f"{name}.py", description=_about(name, scene))
+def main(name: str, scene: Scene | Callable[[], Scene], settings: Settings | None = None) -> None:
+    """Run a scenario from the command line; what is wrong is said in one line.
+
+    A scene from a file is given as the function that reads it.
+    """
     try:
+        scene = scene if isinstance(scene, Scene) else scene()
+        chosen = settings or tyro.cli(Settings, prog=f"{name}.py", description=_about(name, scene))
         run(name, scene, chosen)
     except HqpGraspError as error:
         sys.exit(f"{name}: {error}")

@@ -17,6 +17,7 @@ from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
+UP = np.array([0.0, 0.0, 1.0])
 MAX_PLACES = 24  # of the palm, before a draw is given up
 SHIFT = 0.01  # [m] the palm moves by this along the vertical, away from an edge that was met,
 TURN = np.radians(15.0)  # [rad] and turns by this about its approach axis,
@@ -154,7 +155,7 @@ class _Place:
 
     def position(self, middle: np.ndarray) -> np.ndarray:
         """p_palm (3,) [m], world, for an object whose middle is there (3,)."""
-        return middle + [0.0, 0.0, self.height] - self.distance * self.approach
+        return middle + self.height * UP - self.distance * self.approach
 
     def rotation(self, R_near: np.ndarray) -> np.ndarray:
         """R_world_palm (3, 3): of the two, that whose x axis is, unturned, nearer to R_near's."""

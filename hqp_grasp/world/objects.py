@@ -124,7 +124,8 @@ def read_corners(file: str | Path, scale: float = 1.0) -> np.ndarray:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read corners from {path}: {_reason(error)}") from error
-    numbers, rows = [], []
+    numbers: list[int] = []
+    rows: list[tuple[float, float]] = []
     for number, line in enumerate(lines, start=1):
         cells = line.split(",")
         if not line.strip():

@@ -15,6 +15,7 @@ from hqp_grasp.grasp import as_array
 from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
 from hqp_grasp.world.robot import Robot, RobotDescription
 
+CAN = Cylinder(radius=0.05)  # the paper's first object
 CCD_TOLERANCE = 1e-12  # [m] nearest points of meshes, down to the smallest gaps
 CCD_ITERATIONS = 200
 
@@ -27,7 +28,7 @@ class Scene:
     """
 
     robot: str | Path = "wam_bhand"
-    object: Cylinder | Prism | Body = Cylinder(radius=0.05)
+    object: Cylinder | Prism | Body = CAN
     position: tuple[float, float, float] = (0.72, 0.0, 0.2)  # [m] world
     base: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # [m], unit quaternion w x y z
 
