@@ -26,6 +26,7 @@ from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Miss, Missed
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import ContactTask, ForceTask, KinematicTask, MomentTask, Stack
+from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Scene
 
 PROBES = 4
@@ -76,17 +77,17 @@ def test_every_law_has_its_error_by_its_name_in_every_row(record, stack):
 
 
 def test_status_and_rank_of_a_law_are_those_of_its_level_in_the_step_that_led_there(trial, record):
-    controller = trial.controller(trial.scene, 0)
+    controller, probe = trial.controller(trial.scene, 0), GeometricProbe(trial.scene)
+    history = [Touch(record.grasps[0].q, record.grasps[0])]
     assert all(record.rows[0][f"{c}_{n}"] is None for c in ("status", "rank") for n in ("force",))
-    before = record.grasps[0]
     for row in record.rows[1:]:
-        solution = controller.form.plan(controller.stack, before).solution
-        before = next((grasp for told, grasp in felt(record) if told is row), before)
-        force, both, height = solution.levels[-3:]
+        step = controller.step(history)
+        force, both, height = step.solution.levels[-3:]
         assert (row["status_force"], row["rank_force"]) == (force.status, force.rank)
         for name in ("moment", "kinematic"):  # they share a level
             assert (row[f"status_{name}"], row[f"rank_{name}"]) == (both.status, both.rank)
         assert (row["status_height"], row["rank_height"]) == (height.status, height.rank)
+        history.append(Touch(step.q_target, probe.touch(step.q_target)))
     assert {row["status_force"] for row in record.rows[1:]} <= {"met", "nearest"}
 
 
@@ -241,8 +242,9 @@ def test_a_failure_inside_a_trial_is_raised_by_run_and_told_by_attempt(monkeypat
     assert told.to_table().column("error").to_pylist() == [told.error] * (PROBES + 1)
 
 
-def test_a_start_that_cannot_be_found_is_told_too(monkeypatch, trial):
-    monkeypatch.setattr(start, "_reach", lambda *_: None)
+def test_a_start_that_cannot_be_found_is_told_too(scene, stack):
+    far = dataclasses.replace(scene, position=(3.0, 0.0, 0.2))
+    trial = Trial(far, stack, probes=PROBES, start=start.Start(max_draws=2))
     with pytest.raises(ReachError):
         trial.run(0)
     told = trial.attempt(0)
