@@ -23,7 +23,7 @@ from hqp_grasp.experiments.record import (
     verdicts,
 )
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Miss, Missed
+from hqp_grasp.grasp import Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import ContactTask, ForceTask, KinematicTask, MomentTask, Stack
 from hqp_grasp.touch.geometric import GeometricProbe
