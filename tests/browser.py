@@ -15,6 +15,11 @@ DRAWN = """() => {
   const canvas = document.querySelector('canvas');
   return canvas && getComputedStyle(canvas).opacity == '1' && document.querySelector('input');
 }"""
+# Frames, not seconds: a loaded machine draws few a second.
+FRAMES = """count => new Promise(done => {
+  const next = () => count-- > 0 ? requestAnimationFrame(next) : done();
+  next();
+})"""
 
 
 @contextmanager
@@ -46,6 +51,7 @@ def screenshot(opened):
     """What the page shows, (height, width, 3) of 0 … 255, once it stands still."""
     last = None
     for _ in range(40):
+        opened.evaluate(FRAMES, 15)
         opened.wait_for_timeout(250)
         with io.BytesIO(opened.screenshot()) as png:
             now = (255 * plt.imread(png, format="png")[..., :3]).astype(int)

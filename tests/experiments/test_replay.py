@@ -391,10 +391,10 @@ def seen(written):
         opened.goto(path.as_uri())
         browser.wait_until_drawn(opened)
         height = opened.evaluate("document.querySelector('canvas').clientHeight")
-        for second in ("0.5", "5.5", "0.5"):
+        for second in ("5.5", "0.5", "5.5", "0.5"):  # the first one, until all is loaded
             opened.locator("input").first.fill(second)
             pictures.append(browser.screenshot(opened))
-    return pictures, height, requests, errors, path
+    return pictures[1:], height, requests, errors, path
 
 
 @pytest.mark.browser
