@@ -12,6 +12,7 @@ COMPILE := $(PY) -c 'import numpy as n, hqp_grasp as h; h.HQP().solve([h.Level.e
 MADE := $(VENV)/.made
 READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
+READY_ALL := $(VENV)/.ready-all
 READY_BENCH := $(VENV)/.ready-bench
 # The oldest dependencies that pyproject.toml admits, with the oldest Python where there is one, in an
 # environment of their own. It keeps the compiled solver too: two numbas would overwrite each other's.
@@ -24,12 +25,13 @@ BOUNDS := $(PY) -c 'import tomllib; \
 
 unexport PYTHONPATH PYTHONHOME
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-oldest lint docs bench mutants results clean
+.PHONY: help demo test test-all test-oldest lint docs bench mutants results clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run the cylinder scenario; table on screen, results in out/cylinder'
 	@echo 'make test    lint, check types, run the tests, build the docs strictly'
+	@echo 'make test-all    the same, then the slow tests, which drive a browser (chromium)'
 	@echo 'make test-oldest   run the tests with the oldest dependencies admitted, in .venv-oldest'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make docs    build the site into site/'
@@ -45,6 +47,9 @@ demo: $(READY)
 test: lint $(READY_DEV)
 	$(PY) -m pytest $(PYTEST_ARGS)
 	$(PY) -m mkdocs build --strict --quiet
+
+test-all: test $(READY_ALL)
+	$(PY) -m pytest $(PYTEST_ARGS) -m browser
 
 test-oldest: $(READY_OLDEST)
 	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest $(PYTEST_ARGS)
@@ -108,15 +113,20 @@ clean:
 
 $(READY): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp into $(VENV) (once)'
-	@$(PIP) --editable .
+	@$(PIP) --editable '.[view]'
 	@$(COMPILE)
 	@touch $@
 
 $(READY_DEV): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and its tools into $(VENV) (once)'
-	@$(PIP) --editable '.[test,dev,docs]'
+	@$(PIP) --editable '.[view,test,dev,docs]'
 	@$(COMPILE)
 	@touch $(READY) $@
+
+$(READY_ALL): pyproject.toml $(MADE)
+	@echo 'Installing what drives a browser into $(VENV) (once)'
+	@$(PIP) --editable '.[view,test,dev,docs,browser]'
+	@touch $(READY) $(READY_DEV) $@
 
 $(READY_OLDEST): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and the oldest of all that it needs into $(OLDEST) (once)'

@@ -39,6 +39,10 @@ class SingularTaskError(HqpGraspError, ArithmeticError):
     """A control law is undefined at this grasp, for a reason that the message names."""
 
 
+class MissingExtraError(HqpGraspError, ImportError):
+    """An optional package is not installed; the message gives the line that installs it."""
+
+
 def number(name: str, value: object) -> float:
     """Return `value` as a float, else raise InputError."""
     try:

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hqp_grasp.errors import ResultsError
+from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.record import (
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
@@ -107,6 +107,8 @@ def paired_difference(one: Sequence[bool], other: Sequence[bool]) -> tuple[float
 
 def report(folders: Sequence[str | Path]) -> str:
     """The table of each study, the trials that failed, and each two studies compared in pairs."""
+    if not folders:
+        raise InputError("a report needs at least one results folder")
     studies = {str(folder): outcomes(folder) for folder in folders}
     width = max(len(name) for name in studies)
     heads = ("good", *VERDICTS[1:], "probes to balance", "adduction at the end")

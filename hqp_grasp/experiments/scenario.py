@@ -16,15 +16,18 @@ import tyro
 
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
-from hqp_grasp.errors import HqpGraspError, TrialError
+from hqp_grasp.errors import HqpGraspError, InputError, TrialError
 from hqp_grasp.experiments.plots import convergence
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT, VERDICTS, verdicts
+from hqp_grasp.experiments.replay import frames_of_rows, need_viser, rows_of, write_replay
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.experiments.view import PORT, serve
 from hqp_grasp.tasks import Stack, stack_of
 from hqp_grasp.world.scene import Scene
 
-ABOUT_THE_RUN = {"trials", "seed", "jobs", "out", "strict"}  # settings that no trial reads
+# Settings that no trial reads.
+ABOUT_THE_RUN = {"trials", "seed", "jobs", "out", "strict", "replay", "view", "port"}
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,12 @@ class Settings:
     links: Literal["block", "pass"] = "block"
     """Whether links other than the fingertips are stopped by the object, or pass through it, as in
     the paper."""
+    replay: int = 0
+    """The trial that replay.html plays."""
+    view: bool = False
+    """Open the live viewer at the end."""
+    port: int = PORT
+    """Where the viewer listens, on this machine only; 0: any free port."""
 
 
 def main(name: str, scene: Scene | Callable[[], Scene], settings: Settings | None = None) -> None:
@@ -72,6 +81,8 @@ def main(name: str, scene: Scene | Callable[[], Scene], settings: Settings | Non
         scene = scene if isinstance(scene, Scene) else scene()
         chosen = settings or tyro.cli(Settings, prog=f"{name}.py", description=_about(name, scene))
         run(name, scene, chosen)
+        if chosen.view:
+            serve(_out(name, chosen), port=chosen.port)
     except HqpGraspError as error:
         sys.exit(f"{name}: {error}")
     except KeyboardInterrupt:
@@ -102,13 +113,19 @@ def trial_of(scene: Scene, settings: Settings) -> Trial:
 
 
 def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
-    """Run, print the table, write DIR/probes.parquet and DIR/convergence.png.
+    """Run, print the table, write DIR/probes.parquet, DIR/convergence.png and DIR/replay.html.
 
     Raises TrialError where every trial ends in an error, or, if strict, where one does.
     """
     trial = trial_of(scene, settings)
-    out = settings.out or Path("out") / f"{name}-{settings.stack}-{settings.form}"
+    out = _out(name, settings)
     study = Study(trial, settings.trials, settings.seed, settings.jobs, settings.strict)
+    if not 0 <= settings.replay < settings.trials:
+        raise InputError(
+            f"--replay takes a trial, 0 … {settings.trials - 1}; got {settings.replay}"
+        )
+    if settings.view:
+        need_viser()  # said before the work, not after it
     about = f"{name}: {Stack.of(trial.stack).name}, {settings.trials} trials"
     print(f"{about} of {settings.probes} probes")
     try:
@@ -132,7 +149,22 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
         command = replay_command(scene, settings, failed[0])
         print(f"\nreplay trial {failed[0]}, the first that ended in an error:\n{command}")
     print(f"\nresults  {out / 'probes.parquet'}\nfigure   {figure}")
+    _replay(scene, table, settings.replay, out / "replay.html", name)
     return table
+
+
+def _out(name: str, settings: Settings) -> Path:
+    return settings.out or Path("out") / f"{name}-{settings.stack}-{settings.form}"
+
+
+def _replay(scene: Scene, table: pa.Table, trial: int, path: Path, name: str) -> None:
+    """Write the replay, or say why there is none: the results stand without it."""
+    try:
+        frames = frames_of_rows(rows_of(table, trial), scene.articulated.joints)
+        write_replay(scene, frames, path, f"{name}, trial {trial}")
+        print(f"replay   {path}")
+    except HqpGraspError as error:
+        print(f"replay   none: {error}")
 
 
 def replay_command(scene: Scene, settings: Settings, trial: int) -> str:

@@ -67,6 +67,7 @@ class Study:
         """
         out = Path(out)
         parts = _claim(out, self.configuration())
+        self.trial.scene.save(out / "scene.json")  # for whoever draws it
         missing = [i for i in range(self.trials) if not _is_done(_part(parts, i))]
         bar = tqdm(total=self.trials, initial=self.trials - len(missing), unit="trial", ncols=80)
         failed: TrialError | None = None

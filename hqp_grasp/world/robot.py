@@ -227,6 +227,11 @@ class Robot:
             self._local.q = np.array(q)
         return data
 
+    def bodies(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where all bodies of the model are: (b, 3) [m], and quaternions w x y z (b, 4), world."""
+        data = self._at(q)
+        return data.xpos.copy(), data.xquat.copy()
+
     def jacobian(self, q: np.ndarray) -> np.ndarray:
         """∂x/∂q (3k, n) [m/rad] of the contact points' centres."""
         J = self._point_jacobian(self._at(q))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import HqpGraspError, InputError, ResultsError
 from hqp_grasp.grasp import as_array
 from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
 from hqp_grasp.world.robot import Robot, RobotDescription
@@ -80,6 +81,27 @@ class Scene:
         mujoco.mju_mulQuat(quaternion, turn, np.array(self.base[3:]))
         quaternion /= np.linalg.norm(quaternion)
         return replace(self, base=(*(R @ np.array(self.base[:3]) + p), *quaternion))
+
+    def save(self, path: str | Path) -> None:
+        """Write what `load` needs as JSON: robot by name or folder, object, and their places."""
+        robot = self.robot
+        if isinstance(robot, Path) or "/" in robot:
+            robot = str(Path(robot).resolve())
+        thing = {"kind": type(self.object).__name__} | asdict(self.object)
+        data = {"robot": robot, "object": thing, "position": self.position, "base": self.base}
+        Path(path).write_text(json.dumps(data, indent=2) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """The scene that `save` wrote. Raises ResultsError for a file that holds none."""
+        kinds = {kind.__name__: kind for kind in get_args(get_type_hints(cls)["object"])}
+        try:
+            data = json.loads(Path(path).read_text())
+            thing = dict(data["object"])
+            thing = kinds[thing.pop("kind")](**thing)
+            return cls(data["robot"], thing, data["position"], data["base"])
+        except (OSError, ValueError, KeyError, TypeError, HqpGraspError) as error:
+            raise ResultsError(f"{path} holds no scene: {error}") from error
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.

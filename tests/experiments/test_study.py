@@ -121,7 +121,7 @@ def test_joint_angles_are_kept_with_every_touch(done, trial):
 
 def test_one_file_a_trial_and_no_leftovers(done):
     out, _ = done
-    assert names(out) == ["config.json", "parts", "probes.parquet"]
+    assert names(out) == ["config.json", "parts", "probes.parquet", "scene.json"]
     assert names(out / "parts") == [f"trial_{i:06d}.parquet" for i in range(TRIALS)]
 
 
@@ -211,7 +211,7 @@ def test_an_interrupted_study_keeps_its_complete_trials(monkeypatch, done, study
     monkeypatch.setattr(module, "_run_one", interrupted)
     with pytest.raises(KeyboardInterrupt):
         study.run(out)
-    assert names(out) == ["config.json", "parts"]
+    assert names(out) == ["config.json", "parts", "scene.json"]
     assert names(out / "parts") == ["trial_000000.parquet"]
     monkeypatch.setattr(module, "_run_one", run_one)
     assert same(study.run(out), done[1])

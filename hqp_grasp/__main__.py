@@ -1,0 +1,79 @@
+"""The command line of the package: python -m hqp_grasp COMMAND; --help lists the commands."""
+
+from __future__ import annotations
+
+import pkgutil
+import runpy
+import sys
+from pathlib import Path
+
+from tyro.conf import Positional
+from tyro.extras import SubcommandApp
+
+import hqp_grasp.scenarios
+from hqp_grasp.errors import HqpGraspError, one_of
+from hqp_grasp.experiments import report as reports
+from hqp_grasp.experiments.view import HOST, PORT, serve
+
+app = SubcommandApp()
+
+
+@app.command
+def run(scenario: Positional[str], /) -> None:
+    """Run a scenario; the rest are its own arguments: `run cylinder --help` lists them.
+
+    Args:
+        scenario: cylinder, cylinder_65, hexagon, irregular, prism or object.
+    """
+    names = sorted(module.name for module in pkgutil.iter_modules(hqp_grasp.scenarios.__path__))
+    runpy.run_module(
+        f"hqp_grasp.scenarios.{one_of('scenario', scenario, names)}", run_name="__main__"
+    )
+
+
+@app.command
+def report(folders: Positional[tuple[Path, ...]], /) -> None:
+    """Print what became of the trials of results folders, and compare them in pairs.
+
+    Args:
+        folders: Where scenarios left their results.
+    """
+    print(reports.report(folders))
+
+
+@app.command
+def view(
+    folder: Positional[Path],
+    /,
+    compare: Path | None = None,
+    trial: int | None = None,
+    host: str = HOST,
+    port: int = PORT,
+) -> None:
+    """Show a results folder in the browser: any trial, any probe, failures by kind.
+
+    Args:
+        folder: Where a scenario left its results.
+        compare: A second folder of the same seed, whose robot is drawn beside as a ghost.
+        trial: The trial to show first, at its end.
+        host: Address to listen on; other machines can look on where it is not the loopback.
+        port: Port to listen on; 0 takes any free one.
+    """
+    serve(folder, compare, trial, host, port)
+
+
+def main() -> None:
+    """Run the command that the arguments name; what is wrong is said in one line."""
+    try:
+        if sys.argv[1:2] == ["run"] and len(sys.argv) > 2 and not sys.argv[2].startswith("-"):
+            name = sys.argv[2]
+            sys.argv[1:3] = []  # the scenario reads the rest
+            run(name)
+        else:
+            app.cli(prog="python -m hqp_grasp")
+    except HqpGraspError as error:
+        sys.exit(f"hqp_grasp: {error}")
+
+
+if __name__ == "__main__":
+    main()

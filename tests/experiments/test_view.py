@@ -1,0 +1,225 @@
+"""The live viewer: a results folder, any trial and probe of it, in the browser."""
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import browser
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import hqp_grasp as hg
+from hqp_grasp.errors import MissingExtraError
+from hqp_grasp.experiments import scenario
+from hqp_grasp.experiments.fingerprint import Fingerprint
+from hqp_grasp.experiments.record import verdicts
+from hqp_grasp.experiments.view import Results, serve
+
+pytest.importorskip("viser", reason="no viser: pip install 'hqp_grasp[view]'")
+
+TRIALS, PROBES = 5, 6
+SCENE = hg.Scene()
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Results of two forms from the same starts, and of another seed."""
+    where = tmp_path_factory.mktemp("results")
+    runs = {"strict": {}, "paper": {"form": "paper"}, "other_seed": {"seed": 1, "trials": 1}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "viser", None)  # no replay is needed here
+        for name, changed in runs.items():
+            settings = {"trials": TRIALS, "probes": PROBES, "jobs": 1, "out": where / name}
+            scenario.run("cylinder", SCENE, scenario.Settings(**settings | changed))
+    return where
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def test_a_folder_is_read_a_trial_at_a_time(folders):
+    results = Results.open(folders / "strict")
+    assert (results.trials, results.probes, results.seed) == (TRIALS, PROBES, 0)
+    assert results.scene == SCENE and results.same_scene
+    table = pq.read_table(folders / "strict" / "probes.parquet")
+    rows, verdict = table.to_pylist(), verdicts(table)
+    assert results.failures == {
+        kind: tuple(trial for trial, found in verdict.items() if found == kind)
+        for kind in ("error", "lost", "not balanced", "link inside", "violation")
+    }
+    assert results.rows(3) == [row for row in rows if row["trial"] == 3]
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        SCENE,
+        hg.Scene(robot="bhand", object=hg.Cylinder(0.04, height=0.2), position=(0.1, 0.2, 0.3)),
+        hg.Scene(robot="bhand", base=(0.1, 0.2, 0.3, 0.6, 0.0, 0.8, 0.0)),
+        hg.Scene(object=hg.Prism(((0.05, 0.0), (-0.03, 0.04), (-0.02, -0.05)))),
+    ],
+)
+def test_a_scene_comes_back_from_its_file_to_the_last_bit(tmp_path, scene):
+    scene.save(tmp_path / "scene.json")
+    assert Fingerprint(hg.Scene.load(tmp_path / "scene.json")).parts == Fingerprint(scene).parts
+
+
+def test_a_scene_of_a_robot_folder_keeps_its_absolute_path(tmp_path, monkeypatch):
+    folder = hg.RobotDescription.load("bhand").xml.parent
+    shutil.copytree(folder, tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    hg.Scene(robot="./mine").save("scene.json")
+    monkeypatch.chdir("/")
+    assert hg.Scene.load(tmp_path / "scene.json").robot == str(tmp_path / "mine")
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"robot": "nobody", "object": {"kind": "Cylinder"}}']
+)
+def test_a_file_that_holds_no_scene_is_said(tmp_path, text):
+    (tmp_path / "scene.json").write_text(text)
+    with pytest.raises(hg.ResultsError, match=r"scene\.json holds no scene"):
+        hg.Scene.load(tmp_path / "scene.json")
+
+
+def test_a_folder_that_cannot_be_shown_says_what_is_missing(folders, tmp_path):
+    with pytest.raises(hg.ResultsError, match="there is no folder"):
+        Results.open(tmp_path / "nowhere")
+    broken = tmp_path / "broken"
+    shutil.copytree(folders / "strict", broken)
+    whole = (broken / "probes.parquet").read_bytes()
+    (broken / "probes.parquet").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(hg.ResultsError, match="broken cannot be read"):
+        Results.open(broken)
+    (broken / "scene.json").unlink()
+    with pytest.raises(hg.ResultsError, match=r"has no scene\.json.*run again, completes it"):
+        Results.open(broken)
+
+
+def test_a_robot_that_changed_since_is_noticed(folders, tmp_path):
+    shutil.copytree(folders / "strict", tmp_path / "old")
+    config = json.loads((tmp_path / "old" / "config.json").read_text())
+    config["trial"]["scene"]["robot"]["model"] = "another"
+    (tmp_path / "old" / "config.json").write_text(json.dumps(config))
+    assert not Results.open(tmp_path / "old").same_scene
+
+
+# ---------------------------------------------------------------- mistakes
+
+
+def test_a_ghost_of_other_starts_is_refused(folders):
+    with socket.create_server(("127.0.0.1", 0)) as taken:  # or it would serve for ever
+        port = taken.getsockname()[1]
+        with pytest.raises(hg.InputError, match=r"has seed 0, .*other_seed has 1"):
+            serve(folders / "strict", folders / "other_seed", port=port)
+
+
+def test_a_port_in_use_is_said_and_no_other_is_taken(folders):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(hg.InputError, match=rf"127\.0\.0\.1:{port}: .*in use.*--port"):
+            serve(folders / "strict", port=port)
+
+
+def test_without_viser_the_line_that_installs_it_is_given(folders, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'hqp_grasp\[view\]'"):
+        serve(folders / "strict")
+    settings = scenario.Settings(trials=1, probes=1, view=True, out=tmp_path / "out")
+    with pytest.raises(MissingExtraError):  # before any work
+        scenario.run("cylinder", SCENE, settings)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_answers_a_mistake_in_one_line(tmp_path):
+    command = [sys.executable, "-m", "hqp_grasp", "view", str(tmp_path / "nowhere")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr == f"hqp_grasp: there is no folder {tmp_path / 'nowhere'}\n"
+
+
+# ---------------------------------------------------------------- in a browser
+
+
+@contextmanager
+def served(*arguments):
+    """The command as one types it; yields its address."""
+    command = [sys.executable, "-m", "hqp_grasp", "view", *map(str, arguments), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline()).group()
+        finally:
+            process.terminate()
+
+
+def choose(opened, trial, probe):
+    """Write numbers into the two sliders' boxes."""
+    boxes = opened.locator("input.mantine-NumberInput-input").all()
+    for box, value in zip(boxes, (trial, probe), strict=True):
+        box.fill(str(value))
+        box.press("Enter")
+
+
+def numbers(opened):
+    """The table of the row that is shown: {name: cells}; None under the heading."""
+    text = opened.locator("table", has_text="outcome").inner_text()
+    lines = [line.split("\t") for line in text.splitlines()]
+    return {line[0]: line[1:] for line in lines}
+
+
+def wait_for(opened, heading):
+    opened.get_by_text(heading, exact=True).wait_for(timeout=20_000)
+
+
+@pytest.mark.browser
+def test_trial_3_probe_5_shows_the_numbers_of_that_row(folders):
+    rows = pq.read_table(folders / "strict" / "probes.parquet").to_pylist()
+    row = next(r for r in rows if (r["trial"], r["probe"]) == (3, 5))
+    with (
+        served(folders / "strict") as address,
+        browser.page() as (opened, requests, errors),
+    ):
+        opened.goto(address)
+        browser.wait_until_drawn(opened)
+        wait_for(opened, "trial 0, probe 0")
+        before = browser.screenshot(opened)
+        choose(opened, 3, 5)
+        wait_for(opened, "trial 3, probe 5")
+        shown = numbers(opened)
+        after = browser.screenshot(opened)
+    assert shown["outcome"] == ["touch"]
+    assert shown["eps_f"] == [f"{row['eps_f']:.3e} N²"]
+    assert shown["eps_m"] == [f"{row['eps_m']:.3e} (N·m)²"]
+    assert shown["adduction_deg"] == [f"{row['adduction_deg']:.2f}°"]
+    half = np.s_[:, 320:700]  # the scene, clear of controls
+    assert (np.abs(before[half] - after[half]) > 30).any(axis=2).mean() > 0.05
+    assert errors == []
+    assert all(url.startswith((address, f"blob:{address}", "data:")) for url in requests)
+
+
+@pytest.mark.browser
+def test_one_click_shows_a_failure_and_the_ghost_stands_beside_it(folders):
+    """The paper's form with six probes: most trials are not balanced yet."""
+    bad = Results.open(folders / "paper").failures["not balanced"]
+    assert bad
+    rows = pq.read_table(folders / "strict" / "probes.parquet").to_pylist()
+    row = next(r for r in rows if (r["trial"], r["probe"]) == (bad[-1], PROBES))
+    with (
+        served(folders / "paper", "--compare", folders / "strict") as address,
+        browser.page() as (opened, _, errors),
+    ):
+        opened.goto(address)
+        browser.wait_until_drawn(opened)
+        opened.get_by_role("button", name=str(bad[-1]), exact=True).click()
+        wait_for(opened, f"trial {bad[-1]}, probe {PROBES}")
+        shown = numbers(opened)
+        picture = browser.screenshot(opened)
+    assert shown["eps_f"][1] == f"{row['eps_f']:.3e} N²"
+    red, _, blue = picture[:, 320:700].transpose(2, 0, 1)
+    assert ((blue > red + 40) & (blue > 150)).mean() > 0.01  # the ghost
+    assert errors == []
