@@ -15,7 +15,15 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 # A block of Python, and the block of text that stands right below it where there is one.
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
 EXAMPLES = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page in PAGES}
-SHOWN_ON = ["CONTRIBUTING.md", "README.md", "mink.md", "own-hand.md", "quickstart.md", "solver.md"]
+SHOWN_ON = [
+    "CONTRIBUTING.md",
+    "README.md",
+    "mink.md",
+    "objects.md",
+    "own-hand.md",
+    "quickstart.md",
+    "solver.md",
+]
 
 
 def test_the_pages_that_show_code_are_all_found():
