@@ -33,7 +33,7 @@ ELEVATION = np.radians(np.linspace(30.0, 50.0, 5))
 def measure(
     scene: hg.Scene, draws: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, list[float], Counter[str]]:
-    """Adduction and elevation (draws, 2), found (draws,), CPU seconds of each, why some were not."""
+    """Adduction, elevation (draws, 2), found (draws,), CPU seconds of each, why some were not."""
     probe = hg.GeometricProbe(scene)
     hg.Start().draw(scene, lambda _: probe, np.random.default_rng(0))  # compiles the solver
     drawn, found, seconds, why = np.zeros((draws, 2)), np.zeros(draws, bool), [], Counter[str]()

@@ -1,4 +1,4 @@
-"""Every scenario is one command, from the repository or the installed package; bad files cost a line."""
+"""Every scenario is one command, from a clone or installed; a bad file costs one line."""
 
 import importlib
 import subprocess
@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from hqp_grasp.scenarios.irregular import CORNERS
 
 import hqp_grasp as hg
-from hqp_grasp.scenarios.irregular import CORNERS
 
 FOLDER = Path(__file__).parents[1] / "scenarios"
 TINY = ["--trials", "1", "--probes", "2", "--jobs", "1", "--out", "results"]
@@ -65,7 +65,8 @@ def test_an_outline_off_the_origin_is_recentred_and_told(tmp_path):
 
 
 def test_an_object_runs_from_its_file_and_results_of_another_are_not_continued(tmp_path):
-    body = "<mujoco><worldbody><body><geom type='cylinder' size='{} 0.06'/></body></worldbody></mujoco>"
+    geom = "<geom type='cylinder' size='{} 0.06'/>"
+    body = f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>"
     command = ("-m", "hqp_grasp.scenarios.object", "--object", "can.xml", *TINY)
     (tmp_path / "can.xml").write_text(body.format(0.05))
     done = run(tmp_path, *command)
