@@ -16,8 +16,14 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
 EXAMPLES = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page in PAGES}
 SHOWN_ON = [
-    *("CONTRIBUTING.md", "README.md", "looking.md", "mink.md"),
-    *("own-hand.md", "quickstart.md", "solver.md"),
+    "CONTRIBUTING.md",
+    "README.md",
+    "mink.md",
+    "objects.md",
+    "own-hand.md",
+    "quickstart.md",
+    "solver.md",
+    "looking.md",
 ]
 
 

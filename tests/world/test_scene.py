@@ -49,7 +49,8 @@ def test_a_prism_has_a_finite_height_and_side_above_zero(bad):
         pytest.param(SQUARE[::-1], "counter-clockwise", id="clockwise"),
         pytest.param((*SQUARE, (0.0, -0.01)), "strictly convex", id="dent"),
         pytest.param((*SQUARE, (0.0, -0.03)), "strictly convex", id="collinear"),
-        pytest.param((*SQUARE, SQUARE[0]), "strictly convex", id="repeated corner"),
+        pytest.param((*SQUARE, SQUARE[0]), "leave the last out", id="closed by hand"),
+        pytest.param((*SQUARE[:2], SQUARE[1], *SQUARE[2:]), "repeats the corner", id="repeated"),
         pytest.param(np.add(SQUARE, (0.1, 0.0)), "around the origin", id="origin outside"),
         pytest.param(np.add(SQUARE, (0.03, 0.0)), "around the origin", id="origin on an edge"),
         *(
@@ -205,7 +206,7 @@ def test_a_scene_with_a_robot_from_elsewhere_travels_too(tmp_path):
 
 @pytest.mark.parametrize("thing", ["cylinder", None, Cylinder, 0.05])
 def test_an_unknown_object_lists_the_known_ones(thing):
-    with pytest.raises(InputError, match=r"unknown object .*Cylinder, Prism"):
+    with pytest.raises(InputError, match=r"unknown object .*Cylinder, Prism, Body"):
         Scene(object=thing)
 
 
