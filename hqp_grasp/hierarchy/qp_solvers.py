@@ -29,6 +29,7 @@ from hqp_grasp.hierarchy.level import Stacked
 ACCURACY = 1e-6  # [–] asked of a solver; what it names is settled exactly afterwards
 AT_BOUND = 1e-5  # [–] scaled slack or dual above which a row holds x; well above ACCURACY
 RIDGE = 1e-9  # [–] added to the Hessian, of trace 1 or so: keeps y short where a level is silent
+ROUNDING = 1e-13  # [–] of x: an imbalance or a miss as small is rounding
 SPANNED = 1e-9  # [–] of a row: with less left of it, the rows before it have taken its direction
 ITERATIONS = 25  # of proxqp, outer and in each: ten times what it takes where it converges
 INFINITE = 1e20  # what solvers take for no bound
@@ -57,9 +58,7 @@ def active_rows(rows: Stacked, backend: Backend) -> np.ndarray:
     act, state = np.zeros((2, len(A)), dtype=np.int8)
     x, Z = np.zeros(n), np.eye(n)
     for k in range(p + 1):
-        P, q, G, low, high, index, size = _pose(
-            A, lower, upper, off, rows.row_norm, rows.frobenius, state, x, Z, k
-        )
+        P, q, G, low, high, index, size = _pose(A, lower, upper, off, rows.row_norm, state, x, Z, k)
         if size == 0.0:
             y, z = np.zeros(len(q)), np.zeros(len(index))
         elif len(index) == 0 and k > 0:
@@ -88,7 +87,7 @@ def active_rows(rows: Stacked, backend: Backend) -> np.ndarray:
 
 
 @njit(cache=True, error_model="numpy")
-def _pose(A, lower, upper, off, unit, frobenius, state, x, Z, k):  # type: ignore[no-untyped-def]
+def _pose(A, lower, upper, off, unit, state, x, Z, k):  # type: ignore[no-untyped-def]
     """Level k, or for k = p "x is short", as ½ vᵀP v + qᵀv, low ≤ G v ≤ high, v = (y, s).
 
     Also the rows of G in the stack, and the size of what is asked, in which v and the bounds are
@@ -114,9 +113,11 @@ def _pose(A, lower, upper, off, unit, frobenius, state, x, Z, k):  # type: ignor
             count += 1
             soft += 1
     index = index[:count]
-    scale = frobenius[k] if k < p and frobenius[k] > 0.0 else 1.0
     P = np.zeros((d + soft, d + soft))
     q = np.zeros(d + soft)
+    length = 0.0  # of what is asked and of x, whose rounding is not asked for
+    for j in range(n):
+        length = max(length, abs(x[j]))
     if k == p:
         for a in range(d):
             P[a, a] = 1.0
@@ -124,9 +125,10 @@ def _pose(A, lower, upper, off, unit, frobenius, state, x, Z, k):  # type: ignor
                 q[a] += Z[j, a] * x[j]
     row = np.empty(d)
     for i in range(begin, end):
-        if lower[i] != upper[i]:
+        if lower[i] != upper[i] or unit[i] == 0.0:
             continue
         r = -upper[i]
+        length = max(length, abs(upper[i]) / unit[i])
         for j in range(n):
             r += A[i, j] * x[j]
         for a in range(d):
@@ -135,10 +137,20 @@ def _pose(A, lower, upper, off, unit, frobenius, state, x, Z, k):  # type: ignor
             for a in range(d):
                 row[a] += A[i, j] * Z[j, a]
         for a in range(d):
-            q[a] += row[a] * r / scale / scale
+            q[a] += row[a] * r
             for b in range(d):
-                P[a, b] += row[a] * row[b] / scale / scale
+                P[a, b] += row[a] * row[b]
+    trace = 0.0
     for a in range(d):
+        trace += P[a, a]
+    for i in index[count - soft :]:
+        trace = max(trace, unit[i] * unit[i])
+    if trace == 0.0:
+        trace = 1.0
+    for a in range(d):
+        q[a] /= trace
+        for b in range(d):
+            P[a, b] /= trace
         P[a, a] += RIDGE
     G = np.zeros((count, d + soft))
     low = np.empty(count)
@@ -158,13 +170,13 @@ def _pose(A, lower, upper, off, unit, frobenius, state, x, Z, k):  # type: ignor
         own = c - (count - soft)
         if own >= 0:
             G[c, d + own] = -1.0
-            P[d + own, d + own] = (unit[i] / scale) ** 2
+            P[d + own, d + own] = unit[i] * unit[i] / trace
             size = max(size, low[c], -high[c])
         else:  # met above, up to the solver's accuracy: y = 0 is allowed
             low[c] = min(low[c], 0.0)
             high[c] = max(high[c], 0.0)
-    if size == 0.0 and asks:
-        size = 1.0
+    if size <= ROUNDING * length:
+        size = 1.0 if asks else 0.0
     if size > 0.0:
         for a in range(d):
             q[a] /= size
@@ -281,8 +293,17 @@ def _proxqp(
         settings.eps_rel = 0.0
         settings.eps_primal_inf = settings.eps_dual_inf = 1e-12  # defaults call some infeasible
     qp.init(
-        P, q, None, None, G, np.maximum(lower, -INFINITE), np.minimum(upper, INFINITE), False
-    )  # False: rows have length 1, there is nothing to scale
+        P,
+        q,
+        None,
+        None,
+        G,
+        np.maximum(lower, -INFINITE),
+        np.minimum(upper, INFINITE),
+        False,  # rows have length 1: nothing to scale
+        rho=RIDGE / 10.0,  # the default, 1e-6, is a long way in small steps where P is near 0
+        mu_in=1e-3,  # a third of the iterations that the default takes
+    )
     qp.solve()
     status = qp.results.info.status
     if status != proxsuite.proxqp.PROXQP_SOLVED:
