@@ -62,7 +62,7 @@ MUTANTS = (
         "control/forms.py:clip_to_limits", "x / max(1.0, cap_ratio(x, stack, grasp))", "x", TRIAL
     ),
     # A warm start is not used.
-    Mutant("hierarchy/hqp.py:HQP.solve", "if warm is not None and", "if False and", "hierarchy"),
+    Mutant("hierarchy/hqp.py:HQP._ways", "warm is not None and", "False and", "hierarchy"),
     # Trials count as converged before a relapse.
     Mutant("experiments/scenario.py:summary", "stays.argmax(", "good.argmax(", SCENE),
     # Axes are swapped.
@@ -91,7 +91,7 @@ MUTANTS = (
     Mutant("control/landing.py:LANDING_STEPS", "3", "1", "control"),
     Mutant("control/landing.py:LANDING_DAMPING", "1e-2", "1e-1", "control"),
     Mutant("touch/geometric.py:RETREAT", "0.35", "0.15", "touch"),
-    Mutant("hierarchy/hqp.py:RIDGE", "1e-9", "1e-4", "hierarchy"),
+    Mutant("hierarchy/qp_solvers.py:RIDGE", "1e-9", "1e-4", "hierarchy"),
     Mutant("hierarchy/projection.py:MET", "1e-9", "1e-3", "hierarchy"),
     # Up to here the 15 that survived once; from here 13 more. A slide is taken for a hinge.
     Mutant("world/robot.py:Robot.hessian", " * self._hinge[:, None]", "", "world"),

@@ -17,8 +17,6 @@ from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
 from hqp_grasp.world.robot import Robot, RobotDescription
 
 CAN = Cylinder(radius=0.05)  # the paper's first object
-CCD_TOLERANCE = 1e-12  # [m] nearest points of meshes, down to the smallest gaps
-CCD_ITERATIONS = 200
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,6 @@ class Scene:
                 root.set_frame(frame)
             body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
             self.object.add_geoms(spec, body)
-            spec.option.ccd_tolerance = CCD_TOLERANCE
-            spec.option.ccd_iterations = CCD_ITERATIONS
             return spec.compile()
         except ValueError as error:
             raise InputError(f"{description.xml.name} does not compile: {error}") from error
