@@ -18,12 +18,12 @@ EXAMPLES = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page 
 SHOWN_ON = [
     "CONTRIBUTING.md",
     "README.md",
+    "looking.md",
     "mink.md",
     "objects.md",
     "own-hand.md",
     "quickstart.md",
     "solver.md",
-    "looking.md",
 ]
 
 

@@ -1,5 +1,6 @@
 """The package's command line: scenarios without their folder, reports."""
 
+import subprocess
 import sys
 
 import pyarrow.parquet as pq
@@ -15,8 +16,9 @@ def call(monkeypatch, *arguments):
 
 def test_a_scenario_runs_by_its_name_and_is_reported(monkeypatch, capsys, tmp_path):
     out = tmp_path / "a"
-    tiny = ("--trials", 2, "--probes", 2, "--jobs", 1)
-    call(monkeypatch, "run", "cylinder", *tiny, "--out", out)
+    tiny = ("--trials", "2", "--probes", "2", "--jobs", "1")
+    command = [sys.executable, "-m", "hqp_grasp", "run", "cylinder", *tiny, "--out", str(out)]
+    subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
     assert pq.read_table(out / "probes.parquet").num_rows == 6
     capsys.readouterr()
     call(monkeypatch, "report", out, out)

@@ -20,7 +20,7 @@ def land(robot: Robot, stack: Stack, grasp: Grasp, x: np.ndarray) -> np.ndarray:
     limits = stack.limit_levels(grasp)
     goal = robot.centers(grasp.q).ravel() + grasp.jacobian @ x
     damping = LANDING_DAMPING * np.eye(grasp.n)
-    hqp = HQP()
+    hqp = HQP("active-set")
     for _ in range(LANDING_STEPS):
         rest = goal - robot.centers(grasp.q + x).ravel()
         if np.abs(rest).max() < LANDED:

@@ -233,7 +233,7 @@ def _inverse_kinematics(
     scene: Scene, q: np.ndarray, fixed: list[int], p_palm: np.ndarray, R_palm: np.ndarray
 ) -> tuple[Scene, np.ndarray] | None:
     robot = scene.articulated
-    hqp = HQP()
+    hqp = HQP("active-set")
     free = np.array([j for j in range(robot.n) if j not in fixed], dtype=int)
     keep = np.eye(robot.n)[fixed]
     for _ in range(MAX_IK_STEPS):

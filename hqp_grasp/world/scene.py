@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -83,7 +83,11 @@ class Scene:
         robot = self.robot
         if isinstance(robot, Path) or "/" in robot:
             robot = str(Path(robot).resolve())
-        thing = {"kind": type(self.object).__name__} | asdict(self.object)
+        thing: dict[str, Any] = {"kind": type(self.object).__name__}
+        for each in fields(self.object):
+            if each.init:
+                value = getattr(self.object, each.name)
+                thing[each.name] = str(value) if isinstance(value, Path) else value
         data = {"robot": robot, "object": thing, "position": self.position, "base": self.base}
         Path(path).write_text(json.dumps(data, indent=2) + "\n")
 
