@@ -156,6 +156,11 @@ def attempts(options: Options, indices: range) -> list[Outcome]:
     return [attempt(options, index) for index in indices]
 
 
+def warm_up(options: Options) -> None:
+    """Compile, or load what was compiled: no part of what a call costs."""
+    HQP(options.solver).solve([Level(*rows) for rows in make(options.kind, 0, 0)[0]])
+
+
 def run(options: Options) -> Iterator[Outcome]:
     """Outcomes in the order of their index."""
     stop = options.first + options.problems
@@ -167,7 +172,8 @@ def run(options: Options) -> Iterator[Outcome]:
         return
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")  # one BLAS thread a worker, read as it starts
-    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.jobs, spawn, warm_up, (options,)) as pool:
         for outcomes in pool.map(work, chunks):
             yield from outcomes
 
@@ -211,10 +217,10 @@ def main(options: Options) -> None:
     if min(options.problems, options.jobs) < 1 or min(options.seed, options.first) < 0:
         sys.exit("fuzz: problems and jobs must be ≥ 1, seed and first ≥ 0")
     try:
-        hqp = HQP(solver=options.solver)
+        HQP(options.solver, budget=options.budget)
     except InputError as error:
         sys.exit(f"fuzz: {error}")
-    hqp.solve([Level.equal(np.eye(1), np.ones(1))])  # compiles, or loads what was compiled
+    warm_up(options)
     progress = tqdm(run(options), total=options.problems, unit="problem", smoothing=0.05)
     sys.exit(1 if report(options, list(progress)) else 0)
 

@@ -79,7 +79,7 @@ def active_rows(rows: Stacked, backend: Backend) -> np.ndarray:
                 A, lower, upper, off, rows.row_norm, rows.floor, state, act, x, Z, k, y, z, index
             )
         else:
-            _hold(act, state, z, index)
+            _hold(lower, upper, act, state, z, index)
         if Z.shape[1] == 0:
             break
     act[(lower == upper)] = 2
@@ -187,14 +187,15 @@ def _pose(A, lower, upper, off, unit, state, x, Z, k):  # type: ignore[no-untype
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(act, state, z, index):  # type: ignore[no-untyped-def]
+def _hold(lower, upper, act, state, z, index):  # type: ignore[no-untyped-def]
     """Rows met above that a level pushes against hold x from now on, at the bound it pushes to."""
     largest = 1.0
     for c in range(len(index)):
         largest = max(largest, abs(z[c]))
     for c in range(len(index)):
         i = index[c]
-        if state[i] == MET and abs(z[c]) > AT_BOUND * largest:
+        bound = upper[i] if z[c] > 0.0 else lower[i]
+        if state[i] == MET and abs(z[c]) > AT_BOUND * largest and np.isfinite(bound):
             act[i] = 1 if z[c] > 0.0 else -1
             state[i] = HOLDS
 
@@ -214,7 +215,7 @@ def _take_in(A, lower, upper, off, unit, floor, state, act, x, Z, k, y, z, index
     for j in range(n):
         length += abs(x[j])
     before = state.copy()
-    _hold(act, state, z, index)
+    _hold(lower, upper, act, state, z, index)
     for i in range(off[k], off[k + 1]):
         value = 0.0
         for j in range(n):

@@ -16,7 +16,7 @@ from hqp_grasp.control.forms import SR_DAMPING, TOUCH_RANK, clip_to_limits
 # Two routes to one answer in double precision: 1e-16 times a condition number, which the problems
 # here keep below 1e4, squared at worst (an SR-inverse forms JJᵀ). Asked for is 1e-8.
 TOL = 1e-8
-SOLVERS = ("proxqp", "daqp")
+SOLVERS = ("proxqp", "active-set", "daqp")
 DAMPINGS = [10.0**k for k in range(-10, 3)]
 
 
@@ -25,7 +25,7 @@ def built(problem):
 
 
 def hierarchy(problem, solver="proxqp", **options):
-    """The hierarchy's answer, through the QP solver and nothing else."""
+    """The certified answer of the hierarchy."""
     levels = built(problem)
     answer = HQP(solver=solver, **options).solve(levels)
     assert answer.is_optimal(levels)
