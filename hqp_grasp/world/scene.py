@@ -83,11 +83,8 @@ class Scene:
         robot = self.robot
         if isinstance(robot, Path) or "/" in robot:
             robot = str(Path(robot).resolve())
-        thing: dict[str, Any] = {"kind": type(self.object).__name__}
-        for each in fields(self.object):
-            if each.init:
-                value = getattr(self.object, each.name)
-                thing[each.name] = str(value) if isinstance(value, Path) else value
+        given = {f.name: getattr(self.object, f.name) for f in fields(self.object) if f.init}
+        thing = {"kind": type(self.object).__name__} | given
         data = {"robot": robot, "object": thing, "position": self.position, "base": self.base}
         Path(path).write_text(json.dumps(data, indent=2) + "\n")
 

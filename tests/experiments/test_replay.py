@@ -64,12 +64,19 @@ def played(written):
     return messages(written[0].read_text(encoding="utf-8"))
 
 
+def grasp_at(record, probe):
+    """What was felt at a probe, or last before it."""
+    touches = sum(bool(row["in_contact"]) for row in record.rows[: probe + 1])
+    return record.grasps[touches - 1]
+
+
 def lost(record, at):
     """The same record, its touch lost from probe `at` on."""
     nothing = dict.fromkeys(record.rows[0]) | {"in_contact": False, "other_links": ""}
     miss = nothing | {"outcome": "a finger closed without touching (f2)"}
     rows = (*record.rows[:at], miss, *[nothing] * (len(record.rows) - at - 1))
-    return dataclasses.replace(record, rows=rows, grasps=record.grasps[:at])
+    touches = sum(bool(row["in_contact"]) for row in record.rows[:at])
+    return dataclasses.replace(record, rows=rows, grasps=record.grasps[:touches])
 
 
 def table_of(record, trial=0):
@@ -82,11 +89,13 @@ def table_of(record, trial=0):
 
 
 def test_a_frame_holds_what_the_probe_felt(record):
-    for frame, row, grasp in zip(frames_of(record), record.rows, record.grasps, strict=True):
+    for probe, (frame, row) in enumerate(zip(frames_of(record), record.rows, strict=True)):
+        grasp = grasp_at(record, probe)
         assert np.array_equal(frame.q, grasp.q)
         assert np.array_equal(frame.positions, grasp.positions)
         assert np.array_equal(frame.normals, grasp.normals)
-        assert frame.touched and frame.errors["eps_f"] == row["eps_f"]
+        assert frame.touched == row["in_contact"] and frame.outcome == row["outcome"]
+        assert not frame.touched or frame.errors["eps_f"] == row["eps_f"]
 
 
 @pytest.mark.parametrize("ended", [False, True])
@@ -104,7 +113,7 @@ def test_a_probe_without_touch_keeps_the_last_grasp_and_says_why(record):
     frames = frames_of(lost(record, 7))
     assert len(frames) == PROBES + 1
     for frame in frames[7:]:
-        assert not frame.touched and np.array_equal(frame.q, record.grasps[6].q)
+        assert not frame.touched and np.array_equal(frame.q, grasp_at(record, 6).q)
         assert frame.outcome == "a finger closed without touching (f2)"
         assert np.isnan(frame.errors["eps_f"])
 
@@ -244,13 +253,14 @@ def test_the_time_bar_counts_probes(played):
 
 @pytest.mark.parametrize("probe", [0, 3, PROBES])
 def test_arrows_start_at_the_contacts_of_the_probe(record, played, probe):
-    nodes, grasp = scene_at(played[1], probe + 0.5), record.grasps[probe]
+    nodes, grasp = scene_at(played[1], probe + 0.5), grasp_at(record, probe)
     for name, vector in (("normals", 1.25 * grasp.normals), ("forces", -grasp.normals)):
         arrows = nodes[f"/hand/{name}"]["points"].reshape(-1, 2, 3)
         assert arrows[:, 0] == pytest.approx(grasp.positions, abs=ROUNDED)
         assert arrows[:, 1] == pytest.approx(grasp.positions + ARROW * vector, abs=ROUNDED)
-    assert tuple(nodes["/hand/normals"]["colors"]) == NORMAL_COLOUR
-    assert tuple(nodes["/hand/forces"]["colors"]) == FORCE_COLOUR
+    touched = record.rows[probe]["in_contact"]
+    assert tuple(nodes["/hand/normals"]["colors"]) == (NORMAL_COLOUR if touched else GREY)
+    assert tuple(nodes["/hand/forces"]["colors"]) == (FORCE_COLOUR if touched else GREY)
 
 
 def test_the_net_force_is_drawn_until_it_vanishes(record, played):
@@ -266,7 +276,8 @@ def test_the_net_force_is_drawn_until_it_vanishes(record, played):
 def test_all_points_felt_so_far_are_there(record, played):
     for probe in (0, 5, PROBES):
         points = scene_at(played[1], probe + 0.5)["/hand/felt"]["points"].reshape(-1, 3)
-        felt = np.concatenate([g.positions for g in record.grasps[: probe + 1]])
+        touches = sum(bool(row["in_contact"]) for row in record.rows[: probe + 1])
+        felt = np.concatenate([g.positions for g in record.grasps[:touches]])
         assert points == pytest.approx(felt, abs=ROUNDED)
 
 
@@ -274,7 +285,7 @@ def test_every_body_is_where_the_joint_angles_put_it(record, played):
     model, robot = SCENE.model, SCENE.articulated
     for probe in (0, 4, PROBES):
         data = mujoco.MjData(model)
-        robot.place(data, record.grasps[probe].q)
+        robot.place(data, grasp_at(record, probe).q)
         nodes = scene_at(played[1], probe + 0.5)
         for body in range(1, model.nbody):
             node = {"position": [0, 0, 0], "wxyz": [1, 0, 0, 0]} | nodes[f"/hand/body_{body}"]
@@ -294,7 +305,7 @@ def test_a_lost_grasp_turns_grey_and_the_reason_is_written(record, tmp_path):
     write_replay(SCENE, lost(record, 7), tmp_path / "lost.html")
     nodes = scene_at(messages((tmp_path / "lost.html").read_text(encoding="utf-8"))[1], 7.5)
     arrows = nodes["/hand/normals"]["points"].reshape(-1, 2, 3)
-    assert arrows[:, 0] == pytest.approx(record.grasps[6].positions, abs=ROUNDED)
+    assert arrows[:, 0] == pytest.approx(grasp_at(record, 6).positions, abs=ROUNDED)
     assert tuple(nodes["/hand/normals"]["colors"]) == GREY
     assert "a finger closed without touching (f2)" in nodes["/errors/numbers"]["text"]
 
@@ -436,7 +447,7 @@ def test_moving_along_the_time_bar_moves_the_hand_and_back(seen, record, played)
     (first, later, again), height, *_ = seen
     project = on_screen(played[1], height)
     for probe in (0, 5):
-        x, y = project(SCENE.articulated.palm(record.grasps[probe].q)[0])[0].astype(int)
+        x, y = project(SCENE.articulated.palm(grasp_at(record, probe).q)[0])[0].astype(int)
         region = np.s_[y - 60 : y + 60, x - 60 : x + 60]
         changed = (np.abs(first[region] - later[region]) > 30).any(axis=2).mean()
         assert changed > 0.3

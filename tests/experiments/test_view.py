@@ -1,6 +1,7 @@
 """The live viewer: a results folder, any trial and probe of it, in the browser."""
 
 import json
+import os
 import re
 import shutil
 import socket
@@ -67,6 +68,23 @@ def test_a_folder_is_read_a_trial_at_a_time(folders):
 def test_a_scene_comes_back_from_its_file_to_the_last_bit(tmp_path, scene):
     scene.save(tmp_path / "scene.json")
     assert Fingerprint(hg.Scene.load(tmp_path / "scene.json")).parts == Fingerprint(scene).parts
+
+
+TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def test_an_object_from_a_file_comes_back_while_the_file_is_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "thing.obj").write_text(TETRAHEDRON)
+    scene = hg.Scene(object=hg.Body("thing.obj", scale=0.8))
+    scene.save("scene.json")
+    monkeypatch.chdir("/")
+    loaded = hg.Scene.load(tmp_path / "scene.json")
+    assert Fingerprint(loaded).parts == Fingerprint(scene).parts
+    (tmp_path / "thing.obj").write_text(TETRAHEDRON.replace(".1", ".09"))
+    os.utime(tmp_path / "thing.obj", (0, 0))  # MuJoCo keeps meshes by name and second
+    with pytest.raises(hg.ResultsError, match=r"thing\.obj has changed"):
+        hg.Scene.load(tmp_path / "scene.json")
 
 
 def test_a_scene_of_a_robot_folder_keeps_its_absolute_path(tmp_path, monkeypatch):
