@@ -1,7 +1,7 @@
 """From how many draws of the paper's ranges the hand finds a first touch, and how long it takes.
 
     python benchmarks/starts.py --draws 200 --seed 0
-    python benchmarks/starts.py --object FILE --figure starts.png
+    python benchmarks/starts.py --object FILE --plot starts.png
 
 A histogram over adduction and elevation: found of drawn, and at the end why draws were rejected.
 """
@@ -52,7 +52,7 @@ def measure(
 
 
 def main(
-    draws: int = 200, seed: int = 0, object: Path | None = None, figure: Path | None = None
+    draws: int = 200, seed: int = 0, object: Path | None = None, plot: Path | None = None
 ) -> None:
     """Measure the paper's objects, or one from a file."""
     scenes = {object.stem: hg.Scene(object=hg.Body(object))} if object else SCENES
@@ -82,10 +82,10 @@ def main(
             panel.hist(np.degrees(values[found]), np.degrees(edges), histtype="step", label="found")
             panel.set_xlabel(f"{label} [°]")
         column[0].set_title(name)
-    if figure:
+    if plot:
         panels[0, 0].legend()
-        fig.savefig(figure, dpi=150)
-        print(f"\nfigure {figure}")
+        fig.savefig(plot, dpi=150)
+        print(f"\nfigure {plot}")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ OBJECTS = {
     "hexagon": hg.Prism.regular(6, 0.06),
     "irregular": hg.Prism(CORNERS),
 }
-FROM_FILES = {"prism", "object"}
+FROM_FILES = ("object", "prism")
 
 
 def run(cwd, *arguments):
@@ -32,7 +32,7 @@ def run(cwd, *arguments):
 
 def test_there_is_a_scenario_for_every_object_of_the_paper_and_for_files():
     names = {path.stem for path in FOLDER.glob("*.py")} - {"__init__"}
-    assert names == set(OBJECTS) | FROM_FILES
+    assert names == {*OBJECTS, *FROM_FILES}
 
 
 @pytest.mark.parametrize("name", [*OBJECTS, *FROM_FILES])
