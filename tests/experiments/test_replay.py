@@ -20,6 +20,7 @@ from hqp_grasp.experiments.replay import (
     FORCE_COLOUR,
     GREY,
     NORMAL_COLOUR,
+    Frame,
     frames_of,
     frames_of_rows,
     placed,
@@ -399,19 +400,37 @@ def share(colours, red, green, blue):
     return ((colours >= ranges[:, 0]) & (colours <= ranges[:, 1])).all(axis=1).mean()
 
 
+# Two postures whose touches hide neither tips nor arrows from the camera [rad].
+POSTURES = (
+    (0.421, 0.907, -0.45, 1.975, 0.56, -0.248, 0.476, 0.966, 0.958, 1.469, 0.973),
+    (0.779, 1.28, -1.117, 1.71, 0.616, 0.35, 1.391, 1.262, 0.971, 1.517, 0.901),
+)
+
+
 @pytest.fixture(scope="module")
-def seen(written):
-    """Screenshots at probes 0, 5 and 0 again; the canvas's height; requests; console errors."""
-    path, _ = written
+def touches():
+    """What the hand feels in these two postures."""
+    probe = hg.GeometricProbe(SCENE)
+    return [probe.touch(np.array(q)) for q in POSTURES]
+
+
+@pytest.fixture(scope="module")
+def seen(touches, tmp_path_factory):
+    """Pictures of two probes and the first again; the canvas's height; requests; errors; file."""
+    path = tmp_path_factory.mktemp("seen") / "replay.html"
+    errors = {"eps_f": 1.0, "eps_m": 1.0, "eps_k": 1.0}
+    frames = [Frame(g.q, g.positions, g.normals, errors, "touch", True) for g in touches]
+    write_replay(SCENE, frames, path)
     pictures = []
     with browser.page(offline=True) as (opened, requests, errors):
         opened.goto(path.as_uri())
         browser.wait_until_drawn(opened)
         height = opened.evaluate("document.querySelector('canvas').clientHeight")
-        for second in ("5.5", "0.5", "5.5", "0.5"):  # the first one, until all is loaded
+        for second in ("1.5", "0.5", "1.5", "0.5"):  # the first one, until all is loaded
             opened.locator("input").first.fill(second)
             pictures.append(browser.screenshot(opened))
-    return pictures[1:], height, requests, errors, path
+    first, second, again = pictures[1:]
+    return (first, second, again), height, requests, errors, path
 
 
 @pytest.mark.browser
@@ -423,9 +442,9 @@ def test_the_file_plays_from_the_disk_and_asks_no_other_host(seen):
 
 
 @pytest.mark.browser
-def test_robot_object_and_arrows_show_where_they_should(seen, record, played):
-    (picture, *_), height, *_ = seen
-    project, grasp = on_screen(played[1], height), record.grasps[0]
+def test_robot_object_and_arrows_show_where_they_should(seen, touches):
+    (picture, *_), height, *_, path = seen
+    project, grasp = on_screen(messages(path.read_text(encoding="utf-8"))[1], height), touches[0]
     centres = SCENE.articulated.centers(grasp.q)
     for i in range(grasp.k):
         tip = around(picture, project(centres[i])[0], 4)
@@ -443,11 +462,11 @@ def test_robot_object_and_arrows_show_where_they_should(seen, record, played):
 
 
 @pytest.mark.browser
-def test_moving_along_the_time_bar_moves_the_hand_and_back(seen, record, played):
-    (first, later, again), height, *_ = seen
-    project = on_screen(played[1], height)
-    for probe in (0, 5):
-        x, y = project(SCENE.articulated.palm(grasp_at(record, probe).q)[0])[0].astype(int)
+def test_moving_along_the_time_bar_moves_the_hand_and_back(seen, touches):
+    (first, later, again), height, *_, path = seen
+    project = on_screen(messages(path.read_text(encoding="utf-8"))[1], height)
+    for grasp in touches:
+        x, y = project(SCENE.articulated.palm(grasp.q)[0])[0].astype(int)
         region = np.s_[y - 60 : y + 60, x - 60 : x + 60]
         changed = (np.abs(first[region] - later[region]) > 30).any(axis=2).mean()
         assert changed > 0.3
