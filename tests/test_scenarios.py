@@ -1,6 +1,6 @@
 """Every scenario is one command, from a clone or installed; a bad file costs one line."""
 
-import importlib
+import runpy
 import subprocess
 import sys
 from itertools import combinations_with_replacement
@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hqp_grasp.scenarios.irregular import CORNERS
 
 import hqp_grasp as hg
 
 FOLDER = Path(__file__).parents[1] / "scenarios"
+CORNERS = runpy.run_path(str(FOLDER / "irregular.py"))["CORNERS"]
 TINY = ["--trials", "1", "--probes", "2", "--jobs", "1", "--out", "results"]
 OBJECTS = {
     "cylinder": hg.Cylinder(0.05),
@@ -42,7 +42,7 @@ def test_a_scenario_is_short(name):
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_a_scenario_declares_its_object(name):
-    scene = importlib.import_module(f"hqp_grasp.scenarios.{name}").scene
+    scene = runpy.run_path(str(FOLDER / f"{name}.py"))["scene"]
     assert scene == hg.Scene(object=OBJECTS[name])
 
 

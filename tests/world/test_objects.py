@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.fingerprint import Fingerprint
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.touch.geometric import GeometricProbe
@@ -270,10 +270,14 @@ def test_a_body_is_a_value_that_knows_its_content(tmp_path, monkeypatch):
     body = Body("thing.xml")
     assert body.file == str(path) and body == Body(path) and hash(body) == hash(Body(path))
     assert eval(repr(body)) == body
+    Scene(object=body).save(tmp_path / "scene.json")
+    assert Scene.load(tmp_path / "scene.json") == Scene(object=body)
     copy = pickle.loads(pickle.dumps(Scene(object=body)))
     path.write_text(mjcf("<geom type='sphere' size='0.04'/>"))
     assert copy.model.geom(OBJECT).size[0] == 0.05  # it travels without its file
     assert Body(path) != body
     assert Fingerprint(Body(path)).parts != Fingerprint(body).parts
+    with pytest.raises(ResultsError, match=r"thing\.xml has changed"):
+        Scene.load(tmp_path / "scene.json")
     with pytest.raises(InputError, match=r"thing\.xml has changed"):
         eval(repr(body))
