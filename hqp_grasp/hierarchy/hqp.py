@@ -12,7 +12,7 @@ from hqp_grasp.hierarchy import active_set
 from hqp_grasp.hierarchy.level import Level, LevelReport, Solution, Stacked, optimality, stack
 from hqp_grasp.hierarchy.qp_solvers import BACKENDS, QPSolverError, active_rows
 
-COARSE = 1e-14  # [–] rank tolerance where the default's answer cannot be certified
+COARSE = 1e-13  # [–] rank tolerance where the answer by the default's is not certified
 ROUNDS = 10  # in which many rows may change at once, before the search moves one row at a time
 
 
@@ -113,7 +113,7 @@ class HQP:
             act[upper], act[lower] = 1, -1
             yield "active-set", rows, act, p, ROUNDS
         yield "active-set", rows, equalities.copy(), 1, ROUNDS
-        coarse = 10.0 * max(self.rank_tolerance or 0.0, COARSE)
+        coarse = 2.0 * self.rank_tolerance if self.rank_tolerance else COARSE
         yield "coarser rank", rows.with_rank(coarse), equalities.copy(), 1, ROUNDS
         yield "one row at a time", rows, equalities.copy(), p, 0
 
