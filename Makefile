@@ -73,24 +73,27 @@ mutants: $(READY_DEV)
 # into docs/images/. tests/test_packaging.py knows if docs quote a command that is not here.
 RESULTS := out/results
 keep = $(PY) $(2) > $(RESULTS)/$(1).txt
-cylinder = $(PY) scenarios/cylinder.py --trials 40 $(2) --out $(RESULTS)/$(1) > $(RESULTS)/$(1).txt
+study = $(PY) scenarios/$(1).py --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
 
 results: $(READY_BENCH)
 	rm -rf $(RESULTS)
 	mkdir -p $(RESULTS)
-	$(call cylinder,cylinder-0,--probes 40 --seed 0)
-	$(call cylinder,cylinder-1,--probes 40 --seed 1)
-	$(call cylinder,cylinder-2,--probes 40 --seed 2)
-	$(call cylinder,force-moment,--probes 40 --seed 0 --stack fm)
-	$(call cylinder,wide-caps-0,--probes 40 --seed 0 --joint-cap 0.5 --contact-cap 0.04)
-	$(call cylinder,wide-caps-1,--probes 40 --seed 1 --joint-cap 0.5 --contact-cap 0.04)
-	$(call cylinder,wide-caps-2,--probes 40 --seed 2 --joint-cap 0.5 --contact-cap 0.04)
-	$(call cylinder,eq7,--probes 40 --seed 0 --kinematic-error eq7)
-	$(call cylinder,no-landing,--probes 40 --seed 0 --no-landing)
-	$(call cylinder,clipped,--probes 40 --seed 0 --form clipped)
-	$(call cylinder,paper,--probes 60 --seed 0 --form paper)
-	$(call cylinder,links-pass,--probes 40 --seed 0 --links pass)
-	cp $(RESULTS)/cylinder-0/convergence.png docs/images/cylinder-convergence.png
+	$(call study,cylinder)
+	$(call study,cylinder_65)
+	$(call study,hexagon)
+	$(call study,irregular)
+	@set -e; for form in paper paper-hierarchy clipped; do for object in cylinder hexagon; do \
+	  $(PY) scenarios/$$object.py --trials 1000 --probes 40 --seed 2026 --form $$form \
+	    --out $(RESULTS)/$$object-$$form > $(RESULTS)/$$object-$$form.txt; \
+	done; done
+	$(call study,cylinder,-fm,--stack fm)
+	$(call study,cylinder,-pass,--links pass)
+	$(call study,cylinder,-eq7,--kinematic-error eq7)
+	$(call study,cylinder,-no-landing,--no-landing)
+	$(PY) -m hqp_grasp report $(RESULTS)/cylinder $(RESULTS)/cylinder-* > $(RESULTS)/report-cylinder.txt
+	$(PY) -m hqp_grasp report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
+	cp $(RESULTS)/cylinder/convergence.png docs/images/cylinder-convergence.png
+	$(call keep,prisms,benchmarks/prisms.py --seed 0)
 	$(call keep,probing,benchmarks/probing.py)
 	$(call keep,limits,benchmarks/limits.py)
 	$(call keep,limits-6,benchmarks/limits.py --trials 6)

@@ -1,8 +1,8 @@
 """Grasps that do not balance must not fail either: whole trials on boxes and regular prisms.
 
-    python benchmarks/prisms.py --seed 0 --jobs 2
+    python benchmarks/prisms.py --seed 0
 
-80 trials each on boxes of 6, 8 and 10 cm, 60 each on a triangle, a pentagon and an octagon. Parallel
+80 trials each on boxes of 6, 8 and 10 cm, 60 on a triangle, a pentagon and an octagon. Parallel
 normals and edges are what these have in common. Counts trials by the kinds of `python -m hqp_grasp
 report`.
 """
