@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from hqp_grasp.control.limits import ConfigurationLimit
-from hqp_grasp.control.memory import Outline, SurfaceMemory
+from hqp_grasp.control.memory import UPRIGHT, Outline, SurfaceMemory
 from hqp_grasp.control.paper import laws, paper_levels
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp, Miss, Touch
@@ -19,11 +19,13 @@ from hqp_grasp.hierarchy.level import Level, Solution
 from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Priority, Stack
 
-PATIENCE = 3
+SETTLED = 2e-3
+PATIENCE = 5
 RECENT = 10  # touches
 TRIED = 4
 DISTINCT = 10
 APART = 0.01  # [m]
+ROOM = 0.01  # [m] from end faces
 TOUCH_RANK = 1e-6  # [–] normals felt to 1e-7 say nothing about directions weaker than this
 SR_DAMPING = 1e-5  # λ of eq. 13 [m²/rad²]
 
@@ -258,7 +260,7 @@ def way_back(stack: Stack, history: Sequence[Touch], left: int | None) -> np.nda
         if score[i] < 1.0:
             v = _below(stack, touch.felt)
             stale += 1
-            if v < value - 1e-2 or best < 0:
+            if v < value - SETTLED or best < 0:
                 best, value, stale = i, v, 0
         elif best >= 0:
             departures += 1
@@ -309,7 +311,8 @@ class Aim:
     outline: Outline
     s: np.ndarray
     goal: np.ndarray
-    rise: np.ndarray  # (k,) [m] along the axis
+    height: float  # [m] along the axis, of all contacts
+    end: np.ndarray  # (k,) bool: the contact is on an end face or its rim
     cost: float
 
     @classmethod
@@ -323,13 +326,14 @@ class Aim:
         found = outline.balanced(s)
         cost = np.array([v[0] for v in found])
         goals = np.array([v[1] for v in found])
-        height = p @ a
+        end = np.abs(grasp.normals @ a) > UPRIGHT
+        height = _height(memory, grasp, a, end)
         aims = []
         left = np.ones(len(cost), dtype=bool)
         while left.any() and len(aims) < DISTINCT:
             i = int(np.argmin(np.where(left, cost, np.inf)))
             left &= np.abs(goals - goals[i]).max(axis=1) > APART
-            aims.append(cls(a, outline, s, goals[i], height.mean() - height, float(cost[i])))
+            aims.append(cls(a, outline, s, goals[i], height, end, float(cost[i])))
         return aims
 
     def levels(self, stack: Stack, grasp: Grasp, share: float) -> tuple[list[Level], list[Level]]:
@@ -339,7 +343,8 @@ class Aim:
         t0, x0 = self.outline.at(self.s)
         t1, x1 = self.outline.at(self.s + share * (self.goal - self.s))
         turn = t1 - t0
-        rise = share * self.rise
+        p = grasp.positions + rho[:, None] * n
+        rise = share * (self.height - p @ a)
         u = n @ E.T
         c, s = np.cos(turn), np.sin(turn)
         u1 = np.column_stack([c * u[:, 0] - s * u[:, 1], s * u[:, 0] + c * u[:, 1]])
@@ -347,6 +352,15 @@ class Aim:
         n1 /= np.linalg.norm(n1, axis=1)[:, None]
         dx = (x1 - x0) @ E + rise[:, None] * a
         dp = dx + rho[:, None] * (n1 - n)
+        if self.end.any():
+            t1, x1 = self.outline.at(self.goal)
+            side = np.column_stack([np.cos(t1), np.sin(t1)])
+            p1 = (x1 + rho[:, None] * side) @ E + self.height * a
+            dp = np.where(self.end[:, None], share * (p1 - p), dp)
+            toward = (1.0 - share) * n + share * (side @ E)
+            toward /= np.linalg.norm(toward, axis=1)[:, None]
+            n1 = np.where(self.end[:, None], toward, n1)
+            dx = dp - rho[:, None] * (n1 - n)
         x = grasp.positions - grasp.positions.mean(axis=0)
         levels, below, pending = [], [], 2
         if stack.hold_contacts:
@@ -382,10 +396,27 @@ class Aim:
 
     def way_level(self, grasp, dp, n):
         k = grasp.k
-        t = np.cross(self.axis, n)
-        t /= np.linalg.norm(t, axis=1)[:, None]
+        t0, _ = self.outline.at(self.s)
+        t = np.column_stack([-np.sin(t0), np.cos(t0)]) @ self.outline.frame
         J = grasp.jacobian.reshape(k, 3, -1)
         A = np.einsum("ka,kan->kn", t, J)
         z = np.einsum("a,kan->kn", self.axis, J)
         h = dp @ self.axis
-        return Level.equal(np.concatenate([A, z - z.mean(axis=0)]), np.concatenate([(t * dp).sum(axis=1), h - h.mean()]), "way")
+        return Level.equal(np.concatenate([A, z]), np.concatenate([(t * dp).sum(axis=1), h]), "way")
+
+
+def _height(memory: SurfaceMemory, grasp: Grasp, a: np.ndarray, end: np.ndarray) -> float:
+    """Where along the axis contacts should be."""
+    k = grasp.k
+    x, n, R = memory.positions, memory.normals, memory.radii
+    lean = n @ a
+    side = np.abs(lean) < UPRIGHT
+    middle = x @ a - R * lean
+    if end.all():
+        z = float(middle[side].mean()) if side.any() else float((x @ a).mean())
+    else:
+        z = float(middle[-k:][~end].mean())
+    top, bottom = x[lean > UPRIGHT] @ a, x[lean < -UPRIGHT] @ a
+    z = min(z, top.min(initial=np.inf) - ROOM)
+    low = bottom.max(initial=-np.inf) + ROOM
+    return z if z >= low else float(0.5 * (z + low))

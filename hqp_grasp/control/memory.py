@@ -72,7 +72,8 @@ class SurfaceMemory:
         """
         p = grasp.positions
         p = p - p.mean(axis=0)
-        M = self.normals.T @ self.normals / len(self.normals)
+        early = 0.5 ** (self.probes - self.probes.min())
+        M = (early[:, None] * self.normals).T @ self.normals / early.sum()
         tips = 1e-3 * (p.T @ p) / max(float((p * p).sum()), 1e-12)
         M = M + tips
         for _ in range(2):
