@@ -100,17 +100,11 @@ class Controller:
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
         stack: Stack = self.stack  # type: ignore[assignment]
-        import os
-        BM = os.environ.get("BM", "A")
-        RT = float(os.environ.get("RT", RETREAT))
-        extra = 0
-        if BM == "C": extra = blocked
-        if BM == "D": extra = blocked
-        if blocked and not (BM == "D" and blocked <= 2):
-            stack = stack.within(RetreatLimit(self.robot, blocked * RT))
+        if blocked:
+            stack = stack.within(RetreatLimit(self.robot, blocked * RETREAT))
         left = None if self.budget is None else self.budget - len(history)
         plan = self.form.plan(stack, grasp, history, left)  # type: ignore[union-attr]
-        x = (1.0 if plan.exact else shares[short] * .5**min(extra,3)) * plan.x
+        x = (1.0 if plan.exact else shares[short]) * plan.x
         if self.landing and not plan.exact:
             x = land(self.robot, stack, grasp, x)
         return Step(self._clipped(grasp, x), (), plan, shares[short])
