@@ -94,18 +94,20 @@ class Controller:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
         blocked = sum(missed.reason is Miss.OTHER_LINK for missed in misses)
         short = len(misses) - blocked
-        if short == len(SHARES) or blocked == MAX_RETREATS:
+        shares = getattr(self.form, "shares", SHARES)
+        if short == len(shares) or blocked == MAX_RETREATS:
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
         stack: Stack = self.stack  # type: ignore[assignment]
         if blocked:
             stack = stack.within(RetreatLimit(self.robot, blocked * RETREAT))
-        plan = self.form.plan(stack, grasp)  # type: ignore[union-attr]
-        x = SHARES[short] * plan.x
-        if self.landing:
+        left = None if self.budget is None else self.budget - len(history)
+        plan = self.form.plan(stack, grasp, history, left)  # type: ignore[union-attr]
+        x = (1.0 if plan.exact else shares[short]) * plan.x
+        if self.landing and not plan.exact:
             x = land(self.robot, stack, grasp, x)
-        return Step(self._clipped(grasp, x), (), plan, SHARES[short])
+        return Step(self._clipped(grasp, x), (), plan, shares[short])
 
     def _latest(self, history: Sequence[Touch]) -> tuple[Grasp | None, list[Missed]]:
         """The last grasp felt, and the misses since."""

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
-from hqp_grasp.control.limits import ConfigurationLimit
+from hqp_grasp.control.aim import Aim
+from hqp_grasp.control.limits import ConfigurationLimit, cap_ratio, cap_room
+from hqp_grasp.control.memory import SurfaceMemory
 from hqp_grasp.control.paper import laws, paper_levels
+from hqp_grasp.control.settling import way_back
 from hqp_grasp.errors import one_of
-from hqp_grasp.grasp import Grasp
+from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level, Solution
 from hqp_grasp.hierarchy.projection import Projection
-from hqp_grasp.tasks import Priority, Stack
+from hqp_grasp.tasks import ForceTask, MomentTask, Priority, Stack
 
+RECENT = 10  # touches, whose misses make the hand aim elsewhere
+TRIED = 4  # aims, at most
+REACHED = 0.1  # [–] share of the way that may be missing, or the next aim is tried
+NEAR = 1e-3  # [m] ways shorter than this count as that long
+SHORTENINGS = 3  # of the way to an aim, until its step fits the caps
+CAP_TOLERANCE = 1e-9  # [–] over a cap
 TOUCH_RANK = 1e-6  # [–] normals felt to 1e-7 say nothing about directions weaker than this
 SR_DAMPING = 1e-5  # λ of eq. 13 [m²/rad²]
 
@@ -30,6 +40,7 @@ class Plan:
     limit_active: bool  # a limit holds or has cut the step
     gap: float | None  # [rad] ‖x − projection‖∞ where no limit is active, else None
     solve_us: float  # [µs]
+    exact: bool = False  # x leads to a posture, joint by joint: it is not to be landed
 
 
 class Form(Protocol):
@@ -39,8 +50,13 @@ class Form(Protocol):
         """Raise InputError for a stack that this form cannot compose."""
         ...
 
-    def plan(self, stack: Stack, grasp: Grasp) -> Plan:
-        """The step x = Δq that the laws ask for, within the limits."""
+    def plan(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+    ) -> Plan:
+        """The step x = Δq that the laws ask for, within the limits.
+
+        `grasp` is the last felt; `history` is all that was felt, for a form that remembers.
+        """
         ...
 
 
@@ -58,7 +74,9 @@ class HierarchyForm:
     def check(self, stack: Stack) -> None:
         """Every stack has this form."""
 
-    def plan(self, stack: Stack, grasp: Grasp) -> Plan:
+    def plan(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+    ) -> Plan:
         return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
 
 
@@ -74,7 +92,9 @@ class PaperHierarchyForm:
     def check(self, stack: Stack) -> None:
         laws(stack)
 
-    def plan(self, stack: Stack, grasp: Grasp) -> Plan:
+    def plan(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+    ) -> Plan:
         return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
 
 
@@ -87,7 +107,9 @@ class ClippedForm:
     def check(self, stack: Stack) -> None:
         """Every stack has this form."""
 
-    def plan(self, stack: Stack, grasp: Grasp) -> Plan:
+    def plan(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+    ) -> Plan:
         begin = time.perf_counter()
         solution = self.projection.solve(stack.law_levels(grasp))
         return _clipped(solution, stack, grasp, begin)
@@ -102,13 +124,106 @@ class PaperForm:
     def check(self, stack: Stack) -> None:
         laws(stack)
 
-    def plan(self, stack: Stack, grasp: Grasp) -> Plan:
+    def plan(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+    ) -> Plan:
         begin = time.perf_counter()
         solution = self.projection.solve(paper_levels(stack, grasp))
         return _clipped(solution, stack, grasp, begin)
 
 
-FORMS = ("hierarchy", "paper-hierarchy", "clipped", "paper")
+@dataclass(frozen=True)
+class MemoryForm:
+    """The strict hierarchy, after what all touches together say of the surface.
+
+    Force and moment go after the best of the places where the contacts would balance (`Aim`), and
+    the other laws take what is left. The share of the way that the caps allow is taken; below it,
+    the share of the other laws' step for which they leave room. An aim that limits keep the hand
+    from is passed over for the next, and so is one aim for every two misses among the last touches.
+
+    Without a ForceTask and a MomentTask, and for other than two or three contacts, it is the
+    HierarchyForm.
+    """
+
+    hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
+    shares: ClassVar[tuple[float, ...]] = (1.0, 0.5) * 4  # of a step, while nothing is touched
+
+    def check(self, stack: Stack) -> None:
+        """Every stack has this form."""
+
+    def plan(
+        self,
+        stack: Stack,
+        grasp: Grasp,
+        history: Sequence[Touch] = (),
+        left: int | None = None,
+    ) -> Plan:
+        force = [task for task in stack.tasks if isinstance(task, ForceTask)]
+        moment = [task for task in stack.tasks if isinstance(task, MomentTask)]
+        if not force or not moment or grasp.k not in (2, 3):
+            return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
+        begin = time.perf_counter()
+        history = history or (Touch(grasp.q, grasp),)
+        back = way_back(stack, history, left)
+        if back is not None:
+            return self._back(stack, grasp, back, begin)
+        memory = SurfaceMemory.of(history, force[0].radius)
+        misses = sum(isinstance(touch.felt, Missed) for touch in history[-RECENT:])
+        gain = min(1.0, force[0].gain, moment[0].gain)
+        aims = Aim.each(memory, grasp)
+        aims = aims[min(misses // 2, len(aims) - 1) :][:TRIED]
+        steps = []
+        for aim in aims:
+            steps.append(self._towards(aim, gain, stack))
+            if steps[-1].missing < REACHED:
+                break
+        step = min(steps, key=lambda step: step.missing)
+        solve_us = 1e6 * (time.perf_counter() - begin)
+        limit_active = step.shortened or step.solution.limit_active
+        gap = None if limit_active else float(np.abs(step.solution.x - step.unlimited).max())
+        return Plan(step.solution.x, step.solution, limit_active, gap, solve_us)
+
+    def _towards(self, aim: Aim, gain: float, stack: Stack) -> _Step:
+        grasp, share = aim.grasp, gain
+        projection = Projection(rank_tolerance=self.hqp.rank_tolerance)
+        for _ in range(SHORTENINGS):
+            aimed, rest = aim.levels(stack, share)
+            x = projection.solve(aimed).x
+            ratio = cap_ratio(x, stack, grasp)
+            if ratio <= 1.0 + CAP_TOLERANCE:
+                break
+            share /= ratio
+        unlimited = projection.solve(aimed + rest).x
+        room = cap_room(x, unlimited - x, stack, grasp)
+        rest = [Level.equal(v.A, v.A @ x + room * (v.upper - v.A @ x), v.name) for v in rest]
+        solution = self.hqp.solve(stack.limit_levels(grasp) + aimed + rest)
+        way = aimed[-1]
+        asked = max(float(np.linalg.norm(way.upper)), NEAR)
+        missing = float(np.linalg.norm(way.A @ solution.x - way.upper)) / asked
+        return _Step(solution, unlimited, share < gain or room < 1.0, missing)
+
+    def _back(self, stack: Stack, grasp: Grasp, q: np.ndarray, begin: float) -> Plan:
+        """Straight back to q, joint by joint, as far as the caps allow."""
+        x = q - grasp.q
+        share = 1.0 / max(1.0, cap_ratio(x, stack, grasp))
+        level = Level.equal(np.eye(grasp.n), share * x, "back")
+        solution = self.hqp.solve([*stack.limit_levels(grasp), level])
+        solve_us = 1e6 * (time.perf_counter() - begin)
+        limit_active = share < 1.0 or solution.limit_active
+        return Plan(solution.x, solution, limit_active, None, solve_us, exact=True)
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step towards an aim."""
+
+    solution: Solution
+    unlimited: np.ndarray  # (n,) [rad] the projection of the same levels, without limits
+    shortened: bool
+    missing: float  # [–] share of the way asked for that limits keep from the step
+
+
+FORMS = ("hierarchy", "newton", "paper-hierarchy", "clipped", "paper")
 
 
 def form_of(name: str, solver: str = "proxqp") -> Form:
@@ -116,6 +231,8 @@ def form_of(name: str, solver: str = "proxqp") -> Form:
     one_of("form", name, FORMS)
     hqp = HQP(solver, rank_tolerance=TOUCH_RANK)
     if name == "hierarchy":
+        return MemoryForm(hqp)
+    if name == "newton":
         return HierarchyForm(hqp)
     if name == "paper-hierarchy":
         return PaperHierarchyForm(hqp)
@@ -157,15 +274,3 @@ def clip_to_limits(x: np.ndarray, stack: Stack, grasp: Grasp) -> np.ndarray:
             robot = limit.robot
             x = np.clip(x, robot.q_lower - grasp.q, robot.q_upper - grasp.q)
     return x
-
-
-def cap_ratio(x: np.ndarray, stack: Stack, grasp: Grasp) -> float:
-    """How many times too long x is for the caps of its stack; 1 or less: it fits."""
-    ratio = 0.0
-    for limit in stack.limits:
-        if limit.priority is Priority.CAP:
-            level = limit.level(grasp)
-            value = level.A @ x
-            bound = np.where(value > 0.0, level.upper, -level.lower)
-            ratio = max(ratio, float((np.abs(value) / bound).max(initial=0.0)))
-    return ratio

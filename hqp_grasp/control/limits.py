@@ -9,6 +9,7 @@ import numpy as np
 from hqp_grasp.errors import InputError, number
 from hqp_grasp.grasp import Grasp, as_array
 from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks import Stack
 from hqp_grasp.tasks.limit import Limit, Priority
 from hqp_grasp.world.robot import Robot
 
@@ -95,3 +96,28 @@ class RetreatLimit(Limit):
         approach = self.robot.palm(grasp.q)[1][:, 2]
         A = approach @ self.robot.palm_jacobian(grasp.q)[:3]
         return Level(A[None], np.array([-np.inf]), np.array([-self.distance]), "retreat")
+
+
+def cap_ratio(x: np.ndarray, stack: Stack, grasp: Grasp) -> float:
+    """How many times too long x is for the caps of its stack; 1 or less: it fits."""
+    ratio = 0.0
+    for level in _caps(stack, grasp):
+        value = level.A @ x
+        bound = np.where(value > 0.0, level.upper, -level.lower)
+        ratio = max(ratio, float((np.abs(value) / bound).max(initial=0.0)))
+    return ratio
+
+
+def cap_room(x: np.ndarray, more: np.ndarray, stack: Stack, grasp: Grasp) -> float:
+    """The share of `more`, 0 … 1, that the caps of a stack leave room for beside x."""
+    share = 1.0
+    for level in _caps(stack, grasp):
+        value, step = level.A @ x, level.A @ more
+        grows = step != 0.0
+        room = np.where(step > 0.0, level.upper - value, value - level.lower)
+        share = min(share, float((room[grows] / np.abs(step[grows])).min(initial=1.0)))
+    return max(share, 0.0)
+
+
+def _caps(stack: Stack, grasp: Grasp) -> list[Level]:
+    return [limit.level(grasp) for limit in stack.limits if limit.priority is Priority.CAP]

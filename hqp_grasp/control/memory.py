@@ -1,0 +1,170 @@
+"""What has been felt of the object, as a surface that predicts what has not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hqp_grasp.control.outline import Outline
+from hqp_grasp.errors import InputError
+from hqp_grasp.grasp import Grasp, Touch
+
+CONTRADICTION = 2e-4  # [m] a point may lie beyond the tangent plane of another
+SLACK = 2e-6  # [m] rounding of what was felt
+SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
+LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
+WIDEST = 2.0  # [–] balls are this many times as large as the prior one at most
+EDGE = 1e-3  # [m] a smaller ball is an edge
+EDGE_TURN = 0.5  # [–] share of the angle left, by which an edge is taken to turn on
+SHARPER = 0.6  # [–] radius that each further touch of a face leaves of its corners
+FLATTER = 0.5  # [m] radius of what counts as flat
+FLAT = 1e-3  # [m] a face is known to be flat where it was felt so far apart
+CORNER = 2.4  # [rad] neighbouring faces turn by less where they meet
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMemory:
+    """Every contact felt, by any finger, and the roundest surface through all of them.
+
+    Each contact says that the object, being convex, lies behind its tangent plane. The largest ball
+    that touches the surface there from inside and stays behind every plane felt has the radius
+
+        R_j = min_k n_k·(x_k − x_j)/(1 − n_k·n_j).
+
+    The surface predicted is the hull of these balls: exact on cylinders and spheres from the first
+    grasp, flat between points of one face, sharp at an edge felt beside its face, and elsewhere as
+    round as what was felt allows.
+    """
+
+    positions: np.ndarray  # x (N, 3) [m], world
+    normals: np.ndarray  # n (N, 3), outward, world
+    probes: np.ndarray  # (N,) which touch of the history felt it
+    radii: np.ndarray  # R (N,) [m]
+
+    @classmethod
+    def of(cls, history: Sequence[Touch], radius: float = 0.05) -> SurfaceMemory:
+        """What the hits of a history felt, but for what newer ones contradict.
+
+        `radius` [m] is the object's, where nothing felt bounds it.
+        """
+        hits = [(i, t.felt) for i, t in enumerate(history) if isinstance(t.felt, Grasp)]
+        if not hits:
+            raise InputError("nothing has been felt yet: a memory begins with the first grasp")
+        x = np.concatenate([grasp.positions for _, grasp in hits])
+        n = np.concatenate([grasp.normals for _, grasp in hits])
+        probes = np.concatenate([np.full(grasp.k, i) for i, grasp in hits])
+        beyond = n @ x.T - (n * x).sum(axis=1)[:, None]  # [j, k] of point k over the plane of j
+        apart = np.maximum(beyond, beyond.T) > CONTRADICTION
+        kept = ~(apart & (probes > probes[:, None])).any(axis=1)
+        x, n = x[kept], n[kept]
+        return cls(x, n, probes[kept], largest_balls(x, n, x, n, WIDEST * radius))
+
+    def axis(self, grasp: Grasp) -> np.ndarray:
+        """The direction (3,) along which nothing curves, as far as was felt.
+
+        It is that of the first normals, and then of all that do not lean towards it. Where normals
+        leave it open, it is the one that the contacts of `grasp` lie least along.
+        """
+        p = grasp.positions - grasp.positions.mean(axis=0)
+        spread = 1e-3 * (p.T @ p) / max(float((p * p).sum()), np.finfo(float).tiny)
+        weight = 0.5 ** (self.probes - self.probes.min())
+        for _ in range(3):
+            M = (weight[:, None] * self.normals).T @ self.normals / weight.sum() + spread
+            axis = np.linalg.eigh(M)[1][:, 0]
+            weight = (np.abs(self.normals @ axis) < LEANING).astype(float)
+            if not weight.any():
+                break
+        return np.asarray(axis * np.sign(axis[np.abs(axis).argmax()]))
+
+    def outline(self, axis: np.ndarray, tip_radius: float) -> Outline:
+        """The surface as seen along `axis`, from normals across it."""
+        across = np.abs(self.normals @ axis) < LEANING
+        first = np.eye(3)[np.abs(axis).argmin()]
+        first = first - (first @ axis) * axis
+        first /= np.linalg.norm(first)
+        frame = np.array([first, np.cross(axis, first)])
+        x, n, R = (
+            self.positions[across] @ frame.T,
+            self.normals[across] @ frame.T,
+            self.radii[across],
+        )
+        n = n / np.linalg.norm(n, axis=1)[:, None]
+        felt = np.arctan2(n[:, 1], n[:, 0])
+        corners, sharp = _corners(x, n, R, felt)
+        R = np.minimum(R, _beside_edges(x, n, R, felt))
+        c = np.concatenate([x - R[:, None] * n, corners])
+        return Outline.around(c, np.concatenate([R, sharp]), frame, tip_radius, felt)
+
+
+def largest_balls(
+    x: np.ndarray, n: np.ndarray, at: np.ndarray, normal: np.ndarray, widest: float
+) -> np.ndarray:
+    """Radii (N,) [m] of balls that touch at x from inside, n being the outward normal there.
+
+    They are the largest that stay behind the planes through `at` (M, d) with outward `normal`.
+    """
+    turn = 1.0 - normal @ n.T
+    gap = (normal * at).sum(axis=1)[:, None] - normal @ x.T  # [k, j] of point j behind plane k
+    tells = turn > SAME_NORMAL
+    bound = np.where(tells, (np.maximum(gap, 0.0) + SLACK) / np.where(tells, turn, 1.0), widest)
+    return np.asarray(bound.min(axis=0, initial=widest))
+
+
+def _beside_edges(x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray) -> np.ndarray:
+    """Radii that leave room for edges to turn on, by a share of the angle that points felt leave."""
+    edge = np.flatnonzero(R < EDGE)
+    d = x - x[edge][:, None]
+    bearing = (np.arctan2(d[..., 1], d[..., 0]) - felt[edge][:, None]) % (2.0 * np.pi)
+    bearing = np.where(np.linalg.norm(d, axis=-1) > EDGE, bearing, np.pi)
+    left = np.maximum(bearing.min(axis=1, initial=2.0 * np.pi) - 0.5 * np.pi, 0.0)
+    right = np.maximum(1.5 * np.pi - bearing.max(axis=1, initial=0.0), 0.0)
+    t = np.tile(felt[edge], 2) + EDGE_TURN * np.concatenate([left, -right])
+    normal = np.column_stack([np.cos(t), np.sin(t)])
+    return largest_balls(x, n, np.tile(x[edge], (2, 1)), normal, np.inf)
+
+
+def _corners(
+    x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Discs (c, R) in the corners of neighbouring faces.
+
+    The largest that fits has R = min(d_a, d_b)/tan(half the turn), with d the way from the last
+    point felt to the corner; the longer faces are known to be flat, the smaller it is taken to be.
+    """
+    order = np.argsort(felt)
+    turn = np.diff(felt[order], append=felt[order[0]] + 2.0 * np.pi)
+    last = np.flatnonzero(turn > np.sqrt(2.0 * SAME_NORMAL))  # of each group of equal normals
+    G = len(last)
+    if G < 2:
+        return np.zeros((0, 2)), np.zeros(0)
+    group = np.empty(len(felt), dtype=int)
+    group[order] = np.searchsorted(last, np.arange(len(felt))) % G
+    normal, h = n[order[last]], (n[order[last]] * x[order[last]]).sum(axis=1)
+    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
+    along = (x * tangent[group]).sum(axis=1)
+    low, high, least = np.full(G, np.inf), np.full(G, -np.inf), np.full(G, np.inf)
+    np.minimum.at(low, group, along)
+    np.maximum.at(high, group, along)
+    np.minimum.at(least, group, R)
+    first = np.append(last[-1] + 1 - len(felt), last[:-1] + 1)  # of each group
+    spread = (felt[order[last]] - felt[order[first % len(felt)]]) % (2.0 * np.pi)
+    flat, face = high - low, least >= EDGE
+    flat[spread * FLATTER > flat] = 0.0
+    flat = np.where(flat > FLAT, np.bincount(group, minlength=G) - 1.0, 0.0)
+    a, b = np.arange(G), (np.arange(G) + 1) % G
+    a = a[(turn[last] < CORNER) & face[a] & face[b] & (flat[a] + flat[b] > 0.0)]
+    b, half = (a + 1) % G, 0.5 * turn[last[a]]
+    planes = np.stack([normal[a], normal[b]], axis=1)
+    solved = np.linalg.solve(
+        planes, np.stack([[h[a], h[b]], np.ones((2, len(a)))], -1).swapaxes(0, 1)
+    )
+    corner, inward = solved[..., 0], solved[..., 1]
+    to_a = np.maximum((corner * tangent[a]).sum(axis=1) - high[a], SLACK)
+    to_b = np.maximum(low[b] - (corner * tangent[b]).sum(axis=1), SLACK)
+    sharp = SHARPER ** np.minimum(flat[a] + flat[b], 30.0)
+    sharp = sharp * np.minimum(to_a, to_b) / np.tan(half)
+    c = corner - sharp[:, None] * inward
+    behind = (c @ n.T + sharp[:, None] < (n * x).sum(axis=1) + 1e-5).all(axis=1)
+    return c[behind], sharp[behind]
