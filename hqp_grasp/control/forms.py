@@ -167,6 +167,8 @@ class MemoryForm:
         back = way_back(stack, history, left)
         if back is not None:
             return self._back(stack, grasp, back, begin)
+        if _misses_since_a_grasp(history) // 2 % 2 == 1:  # another way than the memory's
+            return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
         memory = SurfaceMemory.of(history, force[0].radius)
         misses = sum(isinstance(touch.felt, Missed) for touch in history[-RECENT:])
         gain = min(1.0, force[0].gain, moment[0].gain)
@@ -221,6 +223,12 @@ class _Step:
     unlimited: np.ndarray  # (n,) [rad] the projection of the same levels, without limits
     shortened: bool
     missing: float  # [–] share of the way asked for that limits keep from the step
+
+
+def _misses_since_a_grasp(history: Sequence[Touch]) -> int:
+    """How many touches have missed since the last that did not."""
+    felt = [i for i, touch in enumerate(history) if isinstance(touch.felt, Grasp)]
+    return len(history) - 1 - felt[-1]
 
 
 FORMS = ("hierarchy", "newton", "paper-hierarchy", "clipped", "paper")
