@@ -52,7 +52,7 @@ class Aim:
     def predicted(self, share: float) -> tuple[np.ndarray, np.ndarray]:
         """Motion of the tips' centres (k, 3) [m] and normals (k, 3) after a share of the way.
 
-        Along the outline the normal turns as the outline does; from an end face the way is straight.
+        Along the outline the normal turns with it; from an end face the way is straight.
         """
         grasp, E, a = self.grasp, self.outline.frame, self.axis
         n, rho = grasp.normals, _tip_radii(grasp)[:, None]
@@ -99,7 +99,8 @@ class Aim:
         per_way = d / np.where(far > STILL, far, 1.0)
         aside = np.eye(3) - d[:, :, None] * d[:, None, :]
         moved = motion - _tip_radii(grasp)[:, None] * (after - normals)
-        aimed, below = [], []
+        aimed: list[Level] = []
+        below: list[Level] = []
         if stack.hold_contacts:
             rest = (normals * motion).sum(axis=1)
             aimed.append(Level.equal(grasp.normal_jacobian(), rest, "contact"))

@@ -48,9 +48,10 @@ class Controller:
     form="hierarchy" solves the joint-space hierarchy within its limits; "clipped" takes the strict
     projection of the same laws, scaled to the caps and clipped to the ranges; "paper" composes
     gradients in contact space and maps them by the SR-inverse (eq. 11–13), then clips likewise;
-    "paper-hierarchy" puts the paper's two levels strictly below the limits. A `Form` of one's own
-    stands in the place of these names. A stack without caps gets StepLimit(), one without ranges
-    the robot's.
+    "paper-hierarchy" puts the paper's two levels strictly below the limits; "memory" is the
+    hierarchy with laws that know all that was felt, for objects with flat faces and edges. A `Form`
+    of one's own stands in the place of these names. A stack without caps gets StepLimit(), one
+    without ranges the robot's.
 
     After a miss without touch the step from the last grasp is taken again, shorter: SHARES of it
     in turn. Where another link than the fingertips met the object, the palm withdraws on the next

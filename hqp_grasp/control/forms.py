@@ -231,7 +231,7 @@ def _misses_since_a_grasp(history: Sequence[Touch]) -> int:
     return len(history) - 1 - felt[-1]
 
 
-FORMS = ("hierarchy", "newton", "paper-hierarchy", "clipped", "paper")
+FORMS = ("hierarchy", "memory", "paper-hierarchy", "clipped", "paper")
 
 
 def form_of(name: str, solver: str = "proxqp") -> Form:
@@ -239,9 +239,9 @@ def form_of(name: str, solver: str = "proxqp") -> Form:
     one_of("form", name, FORMS)
     hqp = HQP(solver, rank_tolerance=TOUCH_RANK)
     if name == "hierarchy":
-        return MemoryForm(hqp)
-    if name == "newton":
         return HierarchyForm(hqp)
+    if name == "memory":
+        return MemoryForm(hqp)
     if name == "paper-hierarchy":
         return PaperHierarchyForm(hqp)
     return ClippedForm() if name == "clipped" else PaperForm()

@@ -113,7 +113,7 @@ def largest_balls(
 
 
 def _beside_edges(x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """Radii that leave room for edges to turn on, by a share of the angle that points felt leave."""
+    """Radii that leave room for edges to turn on, by a share of the angle left to them."""
     edge = np.flatnonzero(R < EDGE)
     d = x - x[edge][:, None]
     bearing = (np.arctan2(d[..., 1], d[..., 0]) - felt[edge][:, None]) % (2.0 * np.pi)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import daqp
 import numpy as np
@@ -283,7 +284,7 @@ def _proxqp(
     P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     shape = G.shape
-    kept = _kept.__dict__
+    kept: dict[tuple[int, ...], Any] = _kept.__dict__.setdefault("by_shape", {})
     qp = kept.get(shape)
     if qp is None:
         qp = kept[shape] = proxsuite.proxqp.dense.QP(shape[1], 0, shape[0])

@@ -178,7 +178,7 @@ def test_a_malformed_history_is_refused(robot, stack, history, message):
     [
         (
             {"form": "papr"},
-            "unknown form 'papr'; choose one of: hierarchy, paper-hierarchy, clipped, paper",
+            "unknown form 'papr'; choose one of: hierarchy, memory, paper-hierarchy, ",
         ),
         ({"budget": 0}, "at least 1 touch"),
         ({"robot": "wam_bhand"}, "must be a Robot"),
@@ -217,7 +217,7 @@ def test_a_form_of_ones_own_stands_in_the_place_of_a_name(robot, first):
         def check(self, stack):
             pass
 
-        def plan(self, stack, grasp):
+        def plan(self, stack, grasp, history, left):
             plan = form_of("clipped").plan(stack, grasp)
             return dataclasses.replace(plan, x=np.zeros(grasp.n))
 

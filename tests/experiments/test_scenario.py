@@ -316,7 +316,7 @@ def test_help_teaches_every_option_with_its_unit_or_choices(capsys):
     for option in ("stack", "trials", "probes", "seed", "jobs", "out", "form", "solver", "landing"):
         assert re.search(rf"--{option}[ ,]", said)
     assert "f (force), m (moment), k (kinematic)" in said
-    assert "{angle,eq7}" in said and "{hierarchy,paper-hierarchy,clipped,paper}" in said
+    assert "{angle,eq7}" in said and "{hierarchy,memory,paper-hierarchy,clipped,paper}" in said
     assert "[rad]" in said and "[m]" in said
     assert "(default: fmk)" in said and "(default: 40)" in said
     assert "grasps Cylinder(radius=0.05" in said
