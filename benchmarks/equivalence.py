@@ -1,6 +1,10 @@
-"""Hierarchy and projection on every grasp felt: one answer where no limit is active.
+"""Three independent solutions of one hierarchy, on every grasp felt: one answer, with no limit.
 
     python benchmarks/equivalence.py --trials 10 --probes 40 --seed 0
+
+Where no limit is active, proxqp, active-set and the projection give the same x. On every grasp the
+paper's equation 11 is its hierarchy of two levels, J_f ẋ = J_f s_f ▷ ẋ = s_m with s the laws' steps
+in contact space, and equation 13 is one damped level, ‖J q̇ − ẋ‖² + λ‖q̇ − q̇_c‖².
 
 Where limits are active the forms part: the second table says what each leaves of the force law,
 the first of the laws (see limits.py for the forms).
@@ -9,13 +13,15 @@ the first of the laws (see limits.py for the forms).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 import tyro
 from limits import WORSE, force_left, steps
 
 import hqp_grasp as hg
-from hqp_grasp.control.forms import TOUCH_RANK
+from hqp_grasp.control.forms import SR_DAMPING, TOUCH_RANK
+from hqp_grasp.control.paper import contact_step, paper_levels
 
 OBJECTS = {
     "cylinder, 5 cm": hg.Cylinder(radius=0.05),
@@ -30,30 +36,70 @@ CAPS = {
 AGREE = 1e-8  # wanted of every gap
 
 
+SOLVERS = ("proxqp", "active-set")
+
+
 @dataclass
 class Seen:
     """The grasps of one object and one choice of caps."""
 
     lost: int = 0  # trials
-    gap_x: list[float] = field(default_factory=list)  # [rad], no limit active
-    gap_rows: list[float] = field(default_factory=list)  # in the laws' own units
+    gap_x: dict[str, list[float]] = field(default_factory=dict)  # [rad], no limit active
+    gap_rows: list[float] = field(default_factory=list)  # of A x, in the laws' own units
+    paper: dict[str, list[float]] = field(default_factory=dict)  # of eq. 11 [m] and 13 [rad]
     left: dict[str, list[float]] = field(default_factory=dict)  # force [N], a limit active
 
     @property
     def active(self) -> int:
         return len(self.left.get("hierarchy", []))
 
-    def add(self, stack: hg.Stack, grasp: hg.Grasp, hqp: hg.HQP) -> None:
-        """Compare the forms on one grasp."""
-        solution = hqp.solve(stack.levels(grasp))
-        if solution.limit_active:
-            for name, x in steps(stack, grasp, hqp).items():
+    @property
+    def compared(self) -> int:
+        return len(self.gap_rows)
+
+    def add(self, stack: hg.Stack, grasp: hg.Grasp) -> None:
+        """Compare all on one grasp."""
+        self.add_paper(stack, grasp)
+        levels, laws = stack.levels(grasp), stack.law_levels(grasp)
+        hqps = [hg.HQP(solver, rank_tolerance=TOUCH_RANK) for solver in SOLVERS]
+        found = {solver: hqp.solve(levels) for solver, hqp in zip(SOLVERS, hqps, strict=True)}
+        if any(solution.limit_active for solution in found.values()):
+            for name, x in steps(stack, grasp, hqps[0]).items():
                 self.left.setdefault(name, []).append(force_left(grasp, x))
             return
-        laws = stack.law_levels(grasp)
-        away = solution.x - hg.Projection(rank_tolerance=hqp.rank_tolerance).solve(laws).x
-        self.gap_x.append(float(np.abs(away).max()))
-        self.gap_rows.append(max(float(np.abs(level.A @ away).max()) for level in laws))
+        x = {solver: solution.x for solver, solution in found.items()}
+        x["projection"] = hg.Projection(rank_tolerance=TOUCH_RANK).solve(laws).x
+        for one, other in combinations(x, 2):
+            gap = float(np.abs(x[one] - x[other]).max())
+            self.gap_x.setdefault(f"{one} / {other}", []).append(gap)
+        self.gap_rows.append(
+            max(
+                float(np.abs(level.A @ (x[one] - x[other])).max())
+                for level in laws
+                for one, other in combinations(x, 2)
+            )
+        )
+
+    def add_paper(self, stack: hg.Stack, grasp: hg.Grasp) -> None:
+        """Equations 11 and 13 against the hierarchies that they are."""
+        force, moment = (hg.stack_of(letter) for letter in "fm")
+        J_f = hg.ForceTask().contact_jacobian(grasp)
+        eq_11 = [
+            hg.Level.equal(J_f, J_f @ contact_step(force, grasp)),
+            hg.Level.equal(np.eye(3 * grasp.k), contact_step(moment, grasp)),
+        ]
+        reach, rest = paper_levels(stack, grasp)
+        root = np.sqrt(SR_DAMPING)
+        eq_13 = hg.Level.equal(
+            np.concatenate([reach.A, root * rest.A]), np.append(reach.lower, root * rest.lower)
+        )
+        known_11 = contact_step(hg.stack_of("fm"), grasp)
+        known_13 = hg.Projection(damping=SR_DAMPING).solve([reach, rest]).x
+        for solver in SOLVERS:
+            hqp = hg.HQP(solver)
+            for name, levels, known in (("11", eq_11, known_11), ("13", [eq_13], known_13)):
+                gap = float(np.abs(hqp.solve(levels).x - known).max())
+                self.paper.setdefault(f"eq. {name}, {solver}", []).append(gap)
 
 
 def main(
@@ -61,20 +107,15 @@ def main(
     trials: int = 10,
     probes: int = 40,
     letters: str = "fmk",
-    solver: str = "proxqp",
-    shortcuts: bool = True,
 ) -> None:
-    """Print the gaps between hierarchy and projection, and what limits change.
+    """Print the gaps between the solutions, and what limits change.
 
     Args:
         seed: trial i draws from SeedSequence([seed, i])
         trials: random starts of each object with each choice of caps
         probes: touches after the first one, in each trial
         letters: the laws in their order
-        solver: of the hierarchy
-        shortcuts: turned off, every call goes through the QP solver
     """
-    hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK, shortcuts=shortcuts)
     seen: dict[tuple[str, str], Seen] = {}
     for shape, thing in OBJECTS.items():
         scene = hg.Scene(robot="wam_bhand", object=thing)
@@ -84,20 +125,28 @@ def main(
             stack = stack.within(cap, hg.ConfigurationLimit(scene.articulated))
             row = seen[shape, name] = Seen()
             for i in range(trials):
-                record = hg.Trial(scene, stack, probes, hg.HierarchyForm(hqp)).run((seed, i), probe)
+                record = hg.Trial(scene, stack, probes).run((seed, i), probe)
                 row.lost += record.lost
                 for grasp in record.grasps:
-                    row.add(stack, grasp, hqp)
-    print(f"{stack.name}, {trials} trials of {probes} probes each, seed {seed}, {solver}")
+                    row.add(stack, grasp)
+    print(f"{stack.name}, {trials} trials of {probes} probes each, seed {seed}")
     for name, cap in CAPS.items():
         print(f"  {name:8} caps: {cap.joint:g} rad, {cap.contact:g} m")
-    print(f"\nno limit active: gaps between hierarchy and projection (≤ {AGREE:g} wanted)")
-    print(f"{'':26}{'grasps':>8}{'compared':>12}{'gap x [rad]':>13}{'gap A x':>10}{'lost':>6}")
+    print(f"\nlargest gaps (≤ {AGREE:g} wanted); no limit active: of x [rad], and of A x")
+    pairs = [f"{one} / {other}" for one, other in combinations((*SOLVERS, "projection"), 2)]
+    print(f"{'':26}{'grasps':>8}{'compared':>12}" + "".join(f"{p:>25}" for p in pairs) + "     A x")
     for (shape, name), row in seen.items():
-        count = len(row.gap_x)
-        share = f"{count} ({count / (count + row.active):.0%})"
-        gaps = f"{max(row.gap_x, default=np.nan):13.1e}{max(row.gap_rows, default=np.nan):10.1e}"
-        print(f"{shape:18}{name:8}{count + row.active:8}{share:>12}{gaps}{row.lost:6}")
+        total = row.compared + row.active
+        share = f"{row.compared} ({row.compared / total:.0%})"
+        gaps = "".join(f"{max(row.gap_x.get(p, [np.nan])):25.1e}" for p in pairs)
+        last = f"{max(row.gap_rows, default=np.nan):8.1e}"
+        print(f"{shape:18}{name:8}{total:8}{share:>12}{gaps}{last}  lost {row.lost}")
+    print("\nlargest gaps of the paper's equations to their hierarchies, on every grasp [m, rad]")
+    forms_11_13 = [f"eq. {e}, {solver}" for e in (11, 13) for solver in SOLVERS]
+    print(f"{'':26}" + "".join(f"{f:>20}" for f in forms_11_13))
+    for (shape, name), row in seen.items():
+        cells = "".join(f"{max(row.paper[f]):20.1e}" for f in forms_11_13)
+        print(f"{shape:18}{name:8}{cells}")
     print("\na limit active: force left by one step [N], median and max; share above hierarchy's")
     forms = ("hierarchy", "clipped", "SR-inverse", "paper")
     head = "".join(f"{form:>{17 if form == 'hierarchy' else 22}}" for form in forms)

@@ -27,19 +27,14 @@ import numpy as np
 from numba import njit
 
 from hqp_grasp.errors import InputError
-from hqp_grasp.hierarchy.certificate import EPS, VANISHED
+from hqp_grasp.hierarchy.certificate import EPS, ROUNDING
 from hqp_grasp.hierarchy.level import Stacked
 
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
-JACOBI_SWEEPS = 12  # it converges in six or seven
-DUST = EPS  # [–] of a row, for each turn: what is left of it when it has nothing new to say
-SMEAR = 4.0 * EPS  # [–] of a row: rounding of its entries after the turns
-LOOSE = 16.0 * EPS  # [–] of the terms that make up a residual: its rounding
-ROUNDING = 1e-13  # [–] of the terms that make up a residual; below it, it counts as none
-STILL = 1e-9  # [–] of the way to a level's optimum: a shorter step is no progress
-FEASIBLE = 1e-11  # [–] violation of a bound, in units of |bound| + ‖a‖ ‖x‖, that counts as none
-SIGNED = 1e-15  # [–] wrong sign of a multiplier, in units of its level's scale, that counts as none
-SURE = 1e-1  # [–] of what is doubtful about a multiplier; below it, it counts as none in any case
+JACOBI_SWEEPS = 12  # at most; it converges in six or seven
+SMEAR = 4.0 * EPS  # [–] rounding of a row's entries after the turns, and of what is made up of them
+FEASIBLE = 1e-11  # [–] violation of a bound that is rounding, in units of |bound| + ‖a‖ ‖x‖
+SURE = 1e-1  # [–] share of a multiplier's uncertainty that it must exceed for its sign to decide
 
 
 # Rows are passed as a flat array, where they begin and their length. Slices would be counted
@@ -292,7 +287,7 @@ def _pick(rows, V, W, Z, flat_w, flat_z, left, length, v, s, lo, hi, c, o, floor
         best = 0.0
         pick = row
         for i in range(row, hi):
-            tiny = DUST * d * length[i]
+            tiny = EPS * d * length[i]
             if left[i] <= tiny * tiny:
                 if left[i] > 0.0:
                     for j in range(d, n):
@@ -434,7 +429,7 @@ def _reduce(A, off, begin, end, o, frobenius, floor, work, x):
 
     Takes in levels begin … end − 1; those above are reduced. Directions before o are unknowns.
 
-    What is left of a row, after it is reduced by c others, counts as nothing below DUST × c of
+    What is left of a row, after it is reduced by c others, counts as nothing below ε c of
     its length; singular values, below `floor` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
     """
     V, W, Z, xq, xv, rhs = work.V, work.W, work.Z, work.xq, work.xv, work.rhs
@@ -515,7 +510,7 @@ def _weigh(levels, work):
             size = abs(work.target[work.rows[i]])
             for j in range(work.first[k + 1]):
                 size += abs(work.W[i, j] * work.xq[j])
-            work.dim[i] = LOOSE * size
+            work.dim[i] = SMEAR * size
             if abs(work.wa[i]) > ROUNDING * size and work.length[i] > 0.0:
                 work.missed[k] = True
                 work.w[work.rows[i]] = work.wa[i]
@@ -539,7 +534,7 @@ def _column(k, levels, floor, work):
     if k == levels:
         for j in range(top):
             g[j] = work.xq[j]
-            h[j] = SIGNED * abs(work.xq[j])
+            h[j] = SMEAR * abs(work.xq[j])
     elif not work.missed[k]:
         return
     else:
@@ -557,7 +552,7 @@ def _column(k, levels, floor, work):
         r = 0 if work.turned[k] else first[k + 1] - top
         for i in range(hi - 1, lo - 1, -1):
             push = work.wa[i]
-            size = SIGNED * abs(push) + work.dim[i]
+            size = SMEAR * abs(push) + work.dim[i]
             if i < lo + r:
                 push = 0.0
                 size = 0.0
@@ -629,7 +624,7 @@ def _judge(own, side, w, room, push, doubt, scale):
     """
     if own and abs(w) > room:
         return 1 if w * side < 0.0 else -1  # that it cannot be met decides
-    none = doubt if own else max(min(SIGNED * scale, doubt), SURE * doubt)
+    none = doubt if own else max(min(SMEAR * scale, doubt), SURE * doubt)
     if push * side > none:
         return -1
     return 1 if push * side < -none else 0
@@ -720,7 +715,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
     work = _work(M, n, p)
     only = _only_entries(A)
     flat = A.ravel()
-    target, side, wrong = work.target, work.side, work.wrong
+    side, wrong = work.side, work.wrong
     x = np.zeros(n)
     start = np.zeros(n)  # the point that the steps of one row have reached
     kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
@@ -749,13 +744,6 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
         _reduce(A, off, reduced, levels, o, frobenius, floor, work, x)
         reduced = levels
         length = np.sqrt(_dot(x, 0, x, 0, n))
-        for k in range(levels):  # where x vanishes by cancellation, what the levels ask counts
-            s = 0.0
-            for i in range(off[k], off[k + 1]):
-                if act[i] != 0:
-                    s += target[i] * target[i]
-            if frobenius[k] > 0.0:
-                length = max(length, VANISHED * np.sqrt(s) / frobenius[k])
         for k in range(levels):
             for i in range(off[k], off[k + 1]):
                 work.slack[i] = (FEASIBLE * row_norm[i] + floor[k]) * length
@@ -811,7 +799,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
             # A row let go for good reason cannot be the next one met: its sign was rounding.
             if block == last and side[block] == last_side:
                 kept[block] = True
-            elif alpha > STILL:
+            elif alpha > 0.0:
                 kept[:] = False
             last = -1
         else:

@@ -1,9 +1,12 @@
-"""Whether x is the lexicographic optimum of a hierarchy: a check that shares nothing with solvers.
+"""Whether x is the lexicographic optimum of a hierarchy, judged from x and the levels.
+
+The search's multipliers are evidence that is checked and not believed; what the search and this
+check share is `measure`, the sizes of rows and the rank floors of levels.
 
 Level k is optimal, given those above, when A_kᵀ w_k + Σ_{j<k} A_jᵀ λ_jk = 0 for multipliers that
 only push the way a row can: either way for equalities and for rows that cannot be met, inwards
-for rows at a bound, not at all for the others. A pull that is found wanting is judged anew with
-the best multipliers there are, by non-negative least squares.
+for rows at a bound, not at all for the others. Where the evidence does not show that, the best
+multipliers there are decide, found by non-negative least squares.
 """
 
 from __future__ import annotations
@@ -13,17 +16,13 @@ from numba import njit
 from scipy.optimize import nnls
 
 EPS = float(np.finfo(float).eps)
-VANISHED = 1e-3  # [–] of the x that the levels ask for; shorter ones are judged as if this long
-SIGN_PASSES = 8  # rounds of mending signs before the least-squares search is asked
-SMALL = 1e-11  # [–] of the largest pull: what is left of it on another unknown by rounding
-NNLS_ROUNDS = 3  # for each row, before the search for multipliers is given up
-LEAN = 1e8  # [–] a level's proof is not added to another's more often than this
-ROUNDING = 1e-13  # [–] of the terms that make up an imbalance; below it, it counts as none,
-# unless they are huge: next to them any pull is small, and by such terms it could be balanced
-# however wrong x is. Rows that are nearly parallel need them, and then A itself, known to EPS,
-# tells no more:
-EVALUATED = 8.0 * EPS  # [–] of the terms, however huge,
-LOST = 1e-2  # [–] and of the pull: what may be left
+ROUNDING = 1e-13  # [–] of the terms that make up a sum: smaller is rounding
+LEAN = 1e8  # times at most that a level's proof is added to another's: more would be rounding
+# Rows that are nearly parallel balance a pull with huge forces. A is known to EPS only, so a part
+# of these forces may be left over, as long as it is a small part of the pull:
+EVALUATED = 8.0 * EPS  # [–] of the largest sum of forces,
+LOST = 1e-2  # [–] and of the pull
+# Without the second any x at all would pass beside forces that are large enough.
 
 
 @njit(cache=True, error_model="numpy")
@@ -63,142 +62,143 @@ def measure(A, lower, upper, off, rank_tolerance):
 
 
 @njit(cache=True, error_model="numpy")
-def check(A, lower, upper, off, x, lam, tol, row_norm, frobenius, floor, least_norm):
-    """Residuals, and which columns of `lam` (M, p or p + 1) fail to prove their level optimal.
+def _rows(A, lower, upper, off, x, tol, row_norm, floor):
+    """What x leaves of each row, and what each row can hold.
 
-    A level may leave what is below its rank floor. With least_norm, column
-    p must prove that x is the shortest optimum. Returns whether none fails; w (M,) with residuals
-    of the size of rounding set to 0, and missed (p,), the levels with others; pull (M,) the
-    residuals as they are, since a small one of a large row may balance the others; push (M,) 0
-    where a row may not push, 1 upwards, −1 downwards, 2 both; proven (columns,), which do not fail;
-    and scale (n, columns): how much of a level's pull may be left on each unknown: what its own
-    rows' rooms would make up for.
+    Returns w (M,), the residuals, 0 where they are rounding; pull (M,), the same as they are, since
+    a small residual of a large row may balance the others; missed (p,), the levels with a residual
+    that is not rounding; size (p,), ‖pull‖ of each level; push (M,), 0 where a row may not push,
+    1 upwards, −1 downwards, 2 both; and room (M,), how far a row may be off.
     """
     M, n = A.shape
     p = len(off) - 1
-    columns = p + 1 if least_norm else p
-    w = np.empty(M)
-    pull = np.empty(M)  # w as it is: what counts as met may still balance the others
-    nearest = np.empty(M)
-    natural = 0.0
     length = 0.0
     for j in range(n):
         length += x[j] * x[j]
     length = np.sqrt(length)
-    finite = np.isfinite(length)
-    for k in range(p):
-        asked = 0.0
-        for i in range(off[k], off[k + 1]):
-            s = 0.0
-            for j in range(n):
-                s += A[i, j] * x[j]
-            nearest[i] = min(max(s, lower[i]), upper[i])
-            w[i] = s - nearest[i]
-            pull[i] = w[i]
-            asked += nearest[i] * nearest[i]
-        if frobenius[k] > 0.0:
-            natural = max(natural, np.sqrt(asked) / frobenius[k])
-    length = max(length, VANISHED * natural)
-    scale = np.zeros((n, columns))
+    w, pull, room = np.zeros(M), np.zeros(M), np.empty(M)
     push = np.zeros(M, np.int8)
-    own = np.empty(M, np.int64)
-    missed = np.empty(p, np.bool_)
-    size = np.empty(p)
+    missed = np.zeros(p, np.bool_)
+    size = np.zeros(p)
     for k in range(p):
-        rest = 0.0
-        total = 0.0
         for i in range(off[k], off[k + 1]):
-            own[i] = k
-            unit = abs(nearest[i]) + row_norm[i] * length
-            room = tol * unit
-            value = nearest[i] + w[i]
-            if abs(w[i]) <= room:
-                w[i] = 0.0
-            room += floor[k] * length
-            rest += w[i] * w[i]
+            value = 0.0
+            for j in range(n):
+                value += A[i, j] * x[j]
+            nearest = min(max(value, lower[i]), upper[i])
+            room[i] = tol * (abs(nearest) + row_norm[i] * length)
+            if abs(value - nearest) > room[i]:
+                w[i] = value - nearest
+                missed[k] = True
+            room[i] += floor[k] * length
             if row_norm[i] == 0.0:
-                pull[i] = 0.0
-            total += pull[i] * pull[i]
-            up = value >= upper[i] - room
-            down = value <= lower[i] + room
-            if row_norm[i] == 0.0:
-                pass  # it holds nothing
-            elif w[i] != 0.0 or lower[i] == upper[i] or (up and down):
+                continue  # it asks for nothing and holds nothing
+            pull[i] = value - nearest
+            size[k] += pull[i] * pull[i]
+            up = value >= upper[i] - room[i]
+            down = value <= lower[i] + room[i]
+            if w[i] != 0.0 or lower[i] == upper[i] or (up and down):
                 push[i] = 2
             elif up:
                 push[i] = 1
             elif down:
                 push[i] = -1
+        size[k] = np.sqrt(size[k])
+    return w, pull, missed, size, push, room
+
+
+@njit(cache=True, error_model="numpy")
+def _mend_signs(k, off, own, push, forces, unasked):
+    """Make the forces (M, columns) of column k push only the way rows can.
+
+    A row that holds a level between for good must not give way to level k: that level's proof is
+    added, as often as it takes. Other forces of the wrong sign are dropped; what is then missing
+    shows. What the added proof left out as below its rank stays out.
+    """
+    for _ in range(2):  # a mended sign may spoil another
+        mended = False
+        for i in range(off[min(k, len(off) - 1)]):
+            if push[i] == 2 or forces[i, k] * push[i] > 0.0 or forces[i, k] == 0.0:
+                continue
+            t = 0.0
+            for between in range(own[i] + 1, k):
+                if push[i] == 0 or not forces[i, between] * push[i] > 0.0:
+                    continue
+                t = -forces[i, k] / forces[i, between]
+                if t <= LEAN:
+                    break
+                t = 0.0
+            if t == 0.0:
+                forces[i, k] = 0.0
+                continue
+            for r in range(off[between + 1]):
+                forces[r, k] += t * forces[r, between]
+            for j in range(len(unasked)):
+                unasked[j, k] += t * unasked[j, between]
+            mended = True
+        if not mended:
+            break
+
+
+@njit(cache=True, error_model="numpy")
+def check(A, lower, upper, off, x, lam, tol, row_norm, floor, least_norm):
+    """Which columns of `lam` (M, p or p + 1) prove their level optimal.
+
+    With least_norm, column p must prove that x is the shortest optimum. A level may leave what is
+    below its rank floor. Returns proven (columns,); scale (n, columns), how much of a level's pull
+    may be left on each unknown, which is what its own rows' rooms would make up for; and w, pull,
+    missed, push as `_rows` says.
+    """
+    M, n = A.shape
+    p = len(off) - 1
+    columns = p + 1 if least_norm else p
+    w, pull, missed, size, push, room = _rows(A, lower, upper, off, x, tol, row_norm, floor)
+    own = np.empty(M, np.int64)
+    forces = np.zeros((M, columns))
+    scale = np.zeros((n, columns))
+    for k in range(p):
+        for i in range(off[k], off[k + 1]):
+            own[i] = k
+            forces[i, k] = pull[i]
+            for later in range(k + 1, columns):
+                forces[i, later] = lam[i, later]
             if push[i] != 0:
                 for j in range(n):
-                    scale[j, k] += abs(A[i, j]) * room
-        missed[k] = rest > 0.0
-        size[k] = np.sqrt(total)
+                    scale[j, k] += abs(A[i, j]) * room[i]
         for j in range(n):
             scale[j, k] += floor[k] * size[k]
     if least_norm:
-        scale[:, p] = tol * length
-    forces = np.zeros((M, columns))
-    for i in range(M):
-        forces[i, own[i]] = pull[i]
-        for k in range(own[i] + 1, columns):
-            forces[i, k] = lam[i, k]
+        scale[:, p] = tol * np.sqrt((x * x).sum())
     proven = np.empty(columns, np.bool_)
-    every = True
-    imbalance = np.empty((n, columns))
-    unasked = np.zeros((n, columns))  # of it, what is below the level's rank floor
+    imbalance = np.empty(n)
+    unasked = np.zeros((n, columns))  # of the imbalance, what is below the level's rank
     terms = np.empty(n)  # sums of the sizes of what makes it up
     for k in range(columns):
-        for _ in range(SIGN_PASSES):
-            mended = False
-            for i in range(off[min(k, p)]):
-                if push[i] == 2 or forces[i, k] * push[i] > 0.0 or forces[i, k] == 0.0:
-                    continue
-                # A row that holds a level between must not give way: lean on that level's proof.
-                t = 0.0
-                for between in range(own[i] + 1, k):
-                    if push[i] != 0 and forces[i, between] * push[i] > 0.0:
-                        t = -forces[i, k] / forces[i, between]
-                        if t > LEAN:
-                            t = 0.0
-                            continue
-                        for r in range(off[between + 1]):
-                            forces[r, k] += t * forces[r, between]
-                        for j in range(n):
-                            unasked[j, k] += t * unasked[j, between]
-                        mended = True
-                        break
-                if t == 0.0:
-                    forces[i, k] = 0.0  # it may not push like that; what is then missing, shows
-            if not mended:
-                break
+        _mend_signs(k, off, own, push, forces, unasked)
         pulls = 0.0  # the level's own, to be balanced
         for j in range(n):
-            s = x[j] if k == p else 0.0
+            imbalance[j] = x[j] if k == p else 0.0
             terms[j] = 0.0
             for i in range(off[min(k, p)], off[min(k + 1, p)]):
-                s += A[i, j] * forces[i, k]
+                imbalance[j] += A[i, j] * forces[i, k]
                 terms[j] += abs(A[i, j] * forces[i, k])
-            imbalance[j, k] = s
-            pulls = max(pulls, abs(s))
-        for j in range(n):
-            for i in range(off[min(k, p)]):
-                imbalance[j, k] += A[i, j] * forces[i, k]
-                terms[j] += abs(A[i, j] * forces[i, k])
-            imbalance[j, k] -= unasked[j, k]
-            if k < p:
-                most = n * floor[k] * size[k]
-                unasked[j, k] += max(-most, min(most, imbalance[j, k]))
+            pulls = max(pulls, abs(imbalance[j]))
         widest = 0.0  # a force's error reaches other unknowns too
         for j in range(n):
+            for i in range(off[min(k, p)]):
+                imbalance[j] += A[i, j] * forces[i, k]
+                terms[j] += abs(A[i, j] * forces[i, k])
+            imbalance[j] -= unasked[j, k]
+            if k < p:
+                most = n * floor[k] * size[k]
+                unasked[j, k] += max(-most, min(most, imbalance[j]))
             widest = max(widest, terms[j])
         huge = min(EVALUATED * widest, LOST * pulls)
-        proven[k] = finite
+        proven[k] = True
         for j in range(n):
             scale[j, k] += min(scale[j, k], ROUNDING * terms[j])
-            proven[k] &= abs(imbalance[j, k]) <= max(scale[j, k], huge)
-        every &= proven[k]
-    return every, w, missed, pull, push, proven, scale
+            proven[k] &= abs(imbalance[j]) <= max(scale[j, k], huge)  # NaN compares false
+    return proven, scale, w, pull, missed, push
 
 
 def optimality_faults(
@@ -210,7 +210,6 @@ def optimality_faults(
     multipliers: np.ndarray,
     tol: float,
     row_norm: np.ndarray,
-    frobenius: np.ndarray,
     floor: np.ndarray,
     least_norm: bool,
 ) -> tuple[np.ndarray, np.ndarray, dict[int, tuple[float, str]]]:
@@ -219,11 +218,11 @@ def optimality_faults(
     That is said for each level at fault, and for p where x is not shown to be the shortest: how
     many times the imbalance is what may be left, and in words.
     """
-    every, w, missed, pull, push, proven, scale = check(
-        A, lower, upper, off, x, multipliers, tol, row_norm, frobenius, floor, least_norm
+    proven, scale, w, pull, missed, push = check(
+        A, lower, upper, off, x, multipliers, tol, row_norm, floor, least_norm
     )
     faults: dict[int, tuple[float, str]] = {}
-    if every:
+    if proven.all() and np.isfinite(x).all():
         return w, missed, faults
     if not np.isfinite(x).all():
         return w, missed, {0: (np.inf, "x is not finite")}
@@ -247,7 +246,7 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: n
     """
     if not pull.any():
         return 0.0
-    size = np.maximum(scale, SMALL * np.abs(pull).max())
+    size = np.maximum(scale, ROUNDING * np.abs(pull).max())
     rest = pull / size
     rows = _directions(np.concatenate([A[push == 1], -A[push == -1]]) / size)
     free = _directions(A[push == 2] / size)
@@ -260,7 +259,7 @@ def _least_imbalance(pull: np.ndarray, A: np.ndarray, push: np.ndarray, scale: n
     length = float(np.linalg.norm(rest))
     if length > 0.0 and len(rows):
         try:
-            best, _ = nnls(rows.T, -rest / length, maxiter=NNLS_ROUNDS * len(rows))
+            best, _ = nnls(rows.T, -rest / length)
         except RuntimeError:  # it did not converge: these rows are not shown to balance
             best = np.zeros(len(rows))
         rest = rest + length * (rows.T @ best)

@@ -229,7 +229,6 @@ def optimality(
             multipliers,
             tol,
             rows.row_norm,
-            rows.frobenius,
             rows.floor,
             shortest,
         )

@@ -8,10 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hqp_grasp.errors import InputError
-from hqp_grasp.hierarchy.level import Level, LevelReport, Solution, stack
-
-EPS = float(np.finfo(float).eps)
-MET = 1e-9  # [–] residual, in units of |b| + ‖A‖‖x‖, below which a level counts as met
+from hqp_grasp.hierarchy.certificate import EPS
+from hqp_grasp.hierarchy.level import (
+    CERTIFICATE_TOLERANCE,
+    Level,
+    LevelReport,
+    Solution,
+    stack,
+)
 
 
 @dataclass(frozen=True)
@@ -87,5 +91,5 @@ class Projection:
 def _report(level: Level, x: np.ndarray, rank: int) -> LevelReport:
     w = level.residual(x)
     scale = np.abs(level.upper) + np.linalg.norm(level.A, axis=1) * np.linalg.norm(x)
-    met = bool((np.abs(w) <= MET * scale).all())
+    met = bool((np.abs(w) <= CERTIFICATE_TOLERANCE * scale).all())
     return LevelReport(level.name, w, rank, "met" if met else "nearest")

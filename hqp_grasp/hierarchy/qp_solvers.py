@@ -16,7 +16,6 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Callable
-from typing import Any
 
 import daqp
 import numpy as np
@@ -25,15 +24,13 @@ import qpsolvers
 from numba import njit
 from scipy.sparse import csc_matrix
 
+from hqp_grasp.hierarchy.certificate import ROUNDING
 from hqp_grasp.hierarchy.level import Stacked
 
 ACCURACY = 1e-6  # [–] asked of a solver; what it names is settled exactly afterwards
 AT_BOUND = 1e-5  # [–] scaled slack or dual above which a row holds x; well above ACCURACY
-RIDGE = 1e-9  # [–] added to the Hessian, of trace 1 or so: keeps y short where a level is silent
-ROUNDING = 1e-13  # [–] of x: an imbalance or a miss as small is rounding
-SPANNED = 1e-9  # [–] of a row: with less left of it, the rows before it have taken its direction
+SLIGHT = 1e-9  # [–] of a row: no direction of its own; of a Hessian's trace: added to its diagonal
 ITERATIONS = 25  # of proxqp, outer and in each: ten times what it takes where it converges
-INFINITE = 1e20  # what solvers take for no bound
 
 MET, HOLDS = 1, 2  # states of a row: an inequality that is met, a row that takes freedom away
 
@@ -152,7 +149,7 @@ def _pose(A, lower, upper, off, unit, state, x, Z, k):  # type: ignore[no-untype
         q[a] /= trace
         for b in range(d):
             P[a, b] /= trace
-        P[a, a] += RIDGE
+        P[a, a] += SLIGHT
     G = np.zeros((count, d + soft))
     low = np.empty(count)
     high = np.empty(count)
@@ -238,9 +235,9 @@ def _take_in(A, lower, upper, off, unit, floor, state, act, x, Z, k, y, z, index
     m = 0
     for i in range(len(A)):
         if state[i] == HOLDS and before[i] != HOLDS and unit[i] > 0.0:
-            reach[m] = SPANNED
+            reach[m] = SLIGHT
             if off[k] <= i < off[k + 1]:
-                reach[m] = max(SPANNED, floor[k] / unit[i])
+                reach[m] = max(SLIGHT, floor[k] / unit[i])
             for a in range(d):
                 fresh[m, a] = 0.0
             for j in range(n):
@@ -277,17 +274,28 @@ def _take_in(A, lower, upper, off, unit, floor, state, act, x, Z, k, y, z, index
 
 # ---------------------------------------------------------------- the solvers
 
-_kept = threading.local()  # proxsuite's objects by shape: making one takes as long as a solve
+
+class _Kept(threading.local):
+    """proxsuite's objects by shape, each thread its own: with a new one a solve takes half longer.
+
+    Every call sets one up anew and starts from y = 0, so nothing of the call before is left; what
+    a solver tells is which rows are active, and the answer is computed from that.
+    """
+
+    def __init__(self) -> None:
+        self.by_shape: dict[tuple[int, ...], proxsuite.proxqp.dense.QP] = {}
+
+
+_kept = _Kept()
 
 
 def _proxqp(
     P: np.ndarray, q: np.ndarray, G: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     shape = G.shape
-    kept: dict[tuple[int, ...], Any] = _kept.__dict__.setdefault("by_shape", {})
-    qp = kept.get(shape)
+    qp = _kept.by_shape.get(shape)
     if qp is None:
-        qp = kept[shape] = proxsuite.proxqp.dense.QP(shape[1], 0, shape[0])
+        qp = _kept.by_shape[shape] = proxsuite.proxqp.dense.QP(shape[1], 0, shape[0])
         settings = qp.settings
         settings.initial_guess = proxsuite.proxqp.NO_INITIAL_GUESS  # y = 0: where the levels stand
         settings.eps_abs = ACCURACY
@@ -300,10 +308,10 @@ def _proxqp(
         None,
         None,
         G,
-        np.maximum(lower, -INFINITE),
-        np.minimum(upper, INFINITE),
+        lower,
+        upper,
         False,  # rows have length 1: nothing to scale
-        rho=RIDGE / 10.0,  # the default, 1e-6, is a long way in small steps where P is near 0
+        rho=SLIGHT / 10.0,  # the default, 1e-6, is a long way in small steps where P is near 0
         mu_in=1e-3,  # a third of the iterations that the default takes
     )
     qp.solve()
@@ -321,8 +329,8 @@ def _daqp(
         P,
         q,
         G,
-        np.minimum(upper, INFINITE),
-        np.maximum(lower, -INFINITE),
+        upper,
+        lower,
         sense,
         primal_tol=ACCURACY,
     )
