@@ -82,10 +82,14 @@ results: $(READY_BENCH)
 	$(call study,cylinder_65)
 	$(call study,hexagon)
 	$(call study,irregular)
-	@set -e; for form in paper paper-hierarchy clipped; do for object in cylinder hexagon; do \
-	  $(PY) scenarios/$$object.py --trials 1000 --probes 40 --seed 2026 --form $$form \
-	    --out $(RESULTS)/$$object-$$form > $(RESULTS)/$$object-$$form.txt; \
-	done; done
+	$(call study,cylinder,-paper,--form paper)
+	$(call study,hexagon,-paper,--form paper)
+	$(call study,cylinder,-paper-hierarchy,--form paper-hierarchy)
+	$(call study,hexagon,-paper-hierarchy,--form paper-hierarchy)
+	$(call study,cylinder,-clipped,--form clipped)
+	$(call study,hexagon,-clipped,--form clipped)
+	$(call study,hexagon,-memory,--form memory)
+	$(call study,irregular,-memory,--form memory)
 	$(call study,cylinder,-fm,--stack fm)
 	$(call study,cylinder,-pass,--links pass)
 	$(call study,cylinder,-eq7,--kinematic-error eq7)
@@ -107,6 +111,7 @@ results: $(READY_BENCH)
 	$(call keep,solvers,benchmarks/solvers.py)
 	$(call keep,solvers-sizes,benchmarks/solvers.py --sizes --problems 150 --checked 2 --plot docs/images/solvers.png)
 	$(call keep,fuzz,benchmarks/fuzz.py --problems 100000 --seed 3)
+	$(call keep,fuzz-active-set,benchmarks/fuzz.py --problems 20000 --seed 3 --solver active-set)
 	$(call keep,fuzz-oracle,benchmarks/fuzz.py --problems 2500 --seed 5 --against-oracle)
 	@set -e; for kind in easy mid hard; do for solver in proxqp daqp; do \
 	  $(PY) benchmarks/fuzz.py --kind three_level-$$kind --problems 1000 --solver $$solver --against-oracle; \
