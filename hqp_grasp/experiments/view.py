@@ -282,8 +282,8 @@ def serve(
     port: int = PORT,
 ) -> None:
     """Show a results folder in the browser until interrupted, `trial` at its end first."""
-    viser = need_viser()
     results = Results.open(folder)
+    viser = need_viser()
     if trial is not None and not 0 <= trial < results.trials:
         raise InputError(f"{folder} has trials 0 … {results.trials - 1}; got {trial}")
     other = None if compare is None else Results.open(compare)
