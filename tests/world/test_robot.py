@@ -71,6 +71,16 @@ def test_the_jacobian_is_the_rate_of_the_centres(robot):
             np.testing.assert_allclose(J[:, j], (ahead - behind) / (2 * FD_STEP), atol=FD_TOL)
 
 
+def test_the_palms_jacobian_is_the_rate_of_its_place_and_of_its_turning(robot):
+    for q in postures(robot, seed=6, count=3):
+        J = robot.palm_jacobian(q)
+        for j, step in enumerate(FD_STEP * np.eye(robot.n)):
+            (ahead, R_ahead), (behind, R_behind) = robot.palm(q + step), robot.palm(q - step)
+            np.testing.assert_allclose(J[:3, j], (ahead - behind) / (2 * FD_STEP), atol=FD_TOL)
+            turn = (R_ahead - R_behind) / (2 * FD_STEP) @ robot.palm(q)[1].T  # [ω]×
+            np.testing.assert_allclose(J[3:, j], [turn[2, 1], turn[0, 2], turn[1, 0]], atol=FD_TOL)
+
+
 def test_the_hessian_is_the_rate_of_the_jacobian_and_symmetric(robot):
     for q in postures(robot, seed=1):
         H = robot.hessian(q)
