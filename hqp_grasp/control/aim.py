@@ -52,7 +52,8 @@ class Aim:
     def predicted(self, share: float) -> tuple[np.ndarray, np.ndarray]:
         """Motion of the tips' centres (k, 3) [m] and normals (k, 3) after a share of the way.
 
-        Along the outline the normal turns with it; from an end face the way is straight.
+        Along the outline the normal turns as the outline does. From an end face the way leads out
+        beside the object, then along the axis.
         """
         grasp, E, a = self.grasp, self.outline.frame, self.axis
         n, rho = grasp.normals, _tip_radii(grasp)[:, None]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol
 
 import numpy as np
 
 from hqp_grasp.control.aim import Aim
-from hqp_grasp.control.limits import ConfigurationLimit, cap_ratio, cap_room
+from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, cap_ratio, cap_room
 from hqp_grasp.control.memory import SurfaceMemory
 from hqp_grasp.control.paper import laws, paper_levels
 from hqp_grasp.control.settling import way_back
@@ -205,14 +205,20 @@ class MemoryForm:
         return _Step(solution, unlimited, share < gain or room < 1.0, missing)
 
     def _back(self, stack: Stack, grasp: Grasp, q: np.ndarray, begin: float) -> Plan:
-        """Straight back to q, joint by joint, as far as the caps allow."""
+        """Straight back to q, joint by joint, as far as the caps allow.
+
+        The hand has been there: no retreat is due.
+        """
+        limits = tuple(v for v in stack.limits if not isinstance(v, RetreatLimit))
+        stack = replace(stack, limits=limits)
         x = q - grasp.q
         share = 1.0 / max(1.0, cap_ratio(x, stack, grasp))
         level = Level.equal(np.eye(grasp.n), share * x, "back")
         solution = self.hqp.solve([*stack.limit_levels(grasp), level])
-        solve_us = 1e6 * (time.perf_counter() - begin)
         limit_active = share < 1.0 or solution.limit_active
-        return Plan(solution.x, solution, limit_active, None, solve_us, exact=True)
+        gap = None if limit_active else float(np.abs(solution.x - x).max())
+        solve_us = 1e6 * (time.perf_counter() - begin)
+        return Plan(solution.x, solution, limit_active, gap, solve_us, exact=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from hqp_grasp.grasp import Grasp, Touch
 CONTRADICTION = 2e-4  # [m] a point may lie beyond the tangent plane of another
 SLACK = 2e-6  # [m] rounding of what was felt
 SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
+UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which tips decide
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
 WIDEST = 2.0  # [–] balls are this many times as large as the prior one at most
 EDGE = 1e-3  # [m] a smaller ball is an edge
@@ -68,7 +69,7 @@ class SurfaceMemory:
         leave it open, it is the one that the contacts of `grasp` lie least along.
         """
         p = grasp.positions - grasp.positions.mean(axis=0)
-        spread = 1e-3 * (p.T @ p) / max(float((p * p).sum()), np.finfo(float).tiny)
+        spread = UNDECIDED * (p.T @ p) / max(float((p * p).sum()), np.finfo(float).tiny)
         weight = 0.5 ** (self.probes - self.probes.min())
         for _ in range(3):
             M = (weight[:, None] * self.normals).T @ self.normals / weight.sum() + spread
@@ -85,12 +86,9 @@ class SurfaceMemory:
         first = first - (first @ axis) * axis
         first /= np.linalg.norm(first)
         frame = np.array([first, np.cross(axis, first)])
-        x, n, R = (
-            self.positions[across] @ frame.T,
-            self.normals[across] @ frame.T,
-            self.radii[across],
-        )
-        n = n / np.linalg.norm(n, axis=1)[:, None]
+        x, R = self.positions[across] @ frame.T, self.radii[across]
+        n = self.normals[across] @ frame.T
+        n /= np.linalg.norm(n, axis=1)[:, None]
         felt = np.arctan2(n[:, 1], n[:, 0])
         corners, sharp = _corners(x, n, R, felt)
         R = np.minimum(R, _beside_edges(x, n, R, felt))
@@ -113,7 +111,7 @@ def largest_balls(
 
 
 def _beside_edges(x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """Radii that leave room for edges to turn on, by a share of the angle left to them."""
+    """Radii that let edges turn on, by a share of the angle that the points felt leave them."""
     edge = np.flatnonzero(R < EDGE)
     d = x - x[edge][:, None]
     bearing = (np.arctan2(d[..., 1], d[..., 0]) - felt[edge][:, None]) % (2.0 * np.pi)
@@ -131,7 +129,7 @@ def _corners(
     """Discs (c, R) in the corners of neighbouring faces.
 
     The largest that fits has R = min(d_a, d_b)/tan(half the turn), with d the way from the last
-    point felt to the corner; the longer faces are known to be flat, the smaller it is taken to be.
+    point felt to the corner; the more often a face was found flat, the smaller it is taken to be.
     """
     order = np.argsort(felt)
     turn = np.diff(felt[order], append=felt[order[0]] + 2.0 * np.pi)

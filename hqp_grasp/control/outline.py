@@ -20,8 +20,7 @@ class Outline:
     """A closed convex curve, counter-clockwise, by arc length s of a tip's centre riding on it.
 
     Piece p begins at start[p]; a share u of it later the normal has the angle θ = angle + u·width
-    and the curve is at base + radius·n(θ) + u·along. Arcs have along = 0, straight pieces
-    width = 0.
+    and the curve is at base + radius·n(θ) + u·along. Arcs have along 0, straight pieces width 0.
     """
 
     frame: np.ndarray  # E (2, 3): the plane's axes, world; points of the plane are E x

@@ -1,69 +1,390 @@
-"""What has been felt predicts what has not: memories of known shapes, and trials that need one."""
+"""The surface memory on outlines of known shape, and the form that goes by it."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
 from hqp_grasp.scenarios import irregular
 
-from hqp_grasp.control.memory import SurfaceMemory
+from hqp_grasp.control.aim import Aim
+from hqp_grasp.control.controller import Controller
+from hqp_grasp.control.memory import SLACK, UNDECIDED, SurfaceMemory
+from hqp_grasp.control.outline import Outline, directions, wrapped
+from hqp_grasp.control.settling import FORCE_GOAL, MOMENT_GOAL, way_back
 from hqp_grasp.errors import InputError
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
-from hqp_grasp.tasks import stack_of
+from hqp_grasp.history import load_history, save_history
+from hqp_grasp.tasks import ForceTask, MomentTask, stack_of
+from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
-RADIUS = 0.04  # [m]
-TIP = 0.008  # [m]
 UP = np.array([0.0, 0.0, 1.0])
+TIP = 0.008  # [m]
+EXACT = 50 * SLACK  # [m] radii bear SLACK over 1 − n·n', 1/50 at least here
+TURNED = SLACK / 5e-3  # [rad] by which a piece between balls leans, 5 mm long at least here
+HEXAGON = Prism.regular(6, 0.06)
 
 
-def touch(angles, at, probe_height=0.0):
-    """A touch of a surface whose normal at an angle is level, its points given by `at`."""
-    contacts = []
-    for t in angles:
-        n = np.array([np.cos(t), np.sin(t), 0.0])
-        contacts.append(Contact(at(t) + probe_height * UP, n, tip_radius=TIP))
-    k = len(contacts)
-    return Touch(np.zeros(3 * k), Grasp(np.zeros(3 * k), contacts, np.eye(3 * k)))
+def touched(points, normals, tip_radius=TIP):
+    """A history of one grasp, with these contacts (k, 2) at height 0."""
+    contacts = [
+        Contact([*x, 0.0], [*n, 0.0], tip_radius=tip_radius)
+        for x, n in zip(points, normals, strict=True)
+    ]
+    grasp = Grasp(np.zeros(2), tuple(contacts), np.zeros((3 * len(contacts), 2)))
+    return Touch(grasp.q, grasp)
 
 
-def on_circle(t):
-    return RADIUS * np.array([np.cos(t), np.sin(t), 0.0])
+def on_circle(radius, *degrees, center=(0.0, 0.0)):
+    n = directions(np.radians(degrees))
+    return touched(np.array(center) + radius * n, n)
 
 
-def test_points_of_a_circle_predict_the_circle():
-    history = [touch([0.1, 2.0, 4.4], on_circle), touch([0.9, 2.7, 5.1], on_circle, 0.01)]
-    memory = SurfaceMemory.of(history)
-    np.testing.assert_allclose(memory.radii, RADIUS, rtol=0.01)
-    axis = memory.axis(history[-1].felt)
-    np.testing.assert_allclose(np.abs(axis), UP, atol=1e-6)
-    outline = memory.outline(axis, TIP)
-    s = outline.length * np.linspace(0.0, 1.0, 50, endpoint=False)
-    angle, x = outline.at(s)
-    n = np.column_stack([np.cos(angle), np.sin(angle)])
-    np.testing.assert_allclose(x, RADIUS * n, atol=1e-3)
-    assert outline.length == pytest.approx(2.0 * np.pi * (RADIUS + TIP), rel=0.01)
+def on_square(half, rounding, *places):
+    """Contacts on a square with rounded corners: (side, along) on a face, (corner, degrees) off."""
+    x, n = [], []
+    for kind, where, value in places:
+        turn = np.radians(90.0 * where)
+        R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        if kind == "side":
+            x.append(R @ [half, value])
+            n.append(R @ [1.0, 0.0])
+        else:
+            d = directions(np.radians(value))
+            x.append(R @ (half - rounding + rounding * d))
+            n.append(R @ d)
+    return touched(x, n)
 
 
-def test_a_point_that_a_later_touch_contradicts_is_forgotten():
-    """The object has moved by 2 mm: what was felt before lies outside what is felt now."""
-    before = touch([0.0, 2.1, 4.2], on_circle)
-    after = touch([0.0, 2.1, 4.2], lambda t: on_circle(t) + np.array([0.002, 0, 0]))
-    memory = SurfaceMemory.of([before, after])
-    newest = len(memory.probes) - 3
-    assert set(memory.probes[newest:]) == {1}
-    np.testing.assert_allclose(memory.positions[-3:], after.felt.positions)
-    assert len(memory.probes) < 6  # some of the old ones are gone
+def outline_of(*history, radius=0.05):
+    memory = SurfaceMemory.of(history, radius)
+    return memory.outline(UP, TIP)
 
 
-def test_misses_leave_no_trace_and_a_memory_of_nothing_is_refused():
-    first = touch([0.0, 2.1, 4.2], on_circle)
-    missed = Touch(np.zeros(9), Missed(Miss.NO_TOUCH, "finger_1"))
-    np.testing.assert_array_equal(
-        SurfaceMemory.of([first, missed]).positions, SurfaceMemory.of([first]).positions
+def normal_at(outline, *centers):
+    """Angles [deg] that the outline predicts where tips have these centres, as seen from above."""
+    s = outline.locate(np.array(centers) @ outline.frame[:, :2].T)
+    theta, _ = outline.at(s)
+    n = directions(theta) @ outline.frame
+    return np.degrees(np.arctan2(n[:, 1], n[:, 0]))
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.05, 0.065])
+def test_a_circle_is_known_from_three_touches(radius):
+    outline = outline_of(on_circle(radius, -6.0, -77.0, -163.0, center=(0.01, -0.02)))
+    s = np.linspace(0.0, outline.length, 50)
+    theta, x = outline.at(s)
+    true = outline.frame[:, :2] @ [0.01, -0.02] + radius * directions(theta)
+    np.testing.assert_allclose(x, true, atol=EXACT)
+    assert outline.length == pytest.approx(2.0 * np.pi * (radius + TIP), rel=1e-3)
+
+
+def test_points_felt_lie_on_the_outline_with_the_normals_felt():
+    history = on_square(0.04, 0.01, ("side", 0, 0.01), ("corner", 0, 30.0), ("side", 2, -0.02))
+    outline = outline_of(history)
+    grasp = history.felt
+    centers = grasp.positions + TIP * grasp.normals
+    n = grasp.normals
+    felt = np.degrees(np.arctan2(n[:, 1], n[:, 0]))
+    off = wrapped(np.radians(normal_at(outline, *centers[:, :2]) - felt))
+    np.testing.assert_allclose(off, 0.0, atol=TURNED)
+
+
+def test_between_two_points_of_a_face_the_outline_is_straight():
+    history = on_square(0.04, 0.0, ("side", 0, -0.02), ("side", 0, 0.025), ("side", 2, 0.0))
+    outline = outline_of(history)
+    for y in np.linspace(-0.02, 0.025, 7):
+        assert normal_at(outline, (0.04 + TIP, y))[0] == pytest.approx(0.0, abs=np.degrees(TURNED))
+
+
+def test_a_rounded_corner_is_exact_between_the_points_felt_on_it():
+    """Both ends of the arc and its middle: the arc between is the arc of the corner."""
+    history = on_square(
+        0.04, 0.01, ("side", 0, 0.03), ("corner", 0, 45.0), ("side", 1, -0.03), ("side", 2, 0.0)
     )
+    outline = outline_of(history)
+    for degrees in (10.0, 30.0, 45.0, 70.0):
+        center = 0.03 + (0.01 + TIP) * directions(np.radians(degrees))
+        assert normal_at(outline, center)[0] == pytest.approx(degrees, abs=0.5)
+
+
+def test_an_edge_felt_beside_its_face_is_sharp():
+    history = on_square(
+        0.04, 0.0, ("side", 0, 0.01), ("corner", 0, 40.0), ("side", 1, 0.0), ("side", 2, 0.0)
+    )
+    memory = SurfaceMemory.of([history])
+    assert memory.radii[1] < EXACT
+    for degrees in (5.0, 40.0, 85.0):
+        center = 0.04 + TIP * directions(np.radians(degrees))
+        assert normal_at(memory.outline(UP, TIP), center)[0] == pytest.approx(degrees, abs=1.0)
+
+
+def test_an_edge_is_taken_to_turn_on_beyond_what_was_felt():
+    """No ball beside it may lie against the edge's plane, as if the edge went on as a face."""
+    places = ("side", 0, 0.0), ("corner", 0, 30.0), ("side", 2, 0.0)
+    outline = outline_of(on_square(0.04, 0.0, *places))
+    center = 0.04 + TIP * directions(np.radians(33.0))
+    assert normal_at(outline, center)[0] == pytest.approx(33.0, abs=0.5)
+
+
+def test_corners_sharpen_with_every_touch_of_a_flat_face():
+    beside = ("side", 1, 0.0), ("side", 2, 0.0), ("side", 3, 0.0)
+    felt, turned = [], []
+    for y in (0.0, 0.005, 0.01, 0.015):
+        felt.append(on_square(0.04, 0.0, ("side", 0, y), *beside[: 2 + (y > 0.0)]))
+        turned.append(normal_at(outline_of(*felt), (0.04 + TIP, 0.025))[0])
+    assert all(later < earlier for earlier, later in itertools.pairwise(turned))
+
+
+def test_normals_alike_leave_the_radius_to_the_prior():
+    memory = SurfaceMemory.of([on_square(0.04, 0.0, *[("side", 0, y) for y in (-0.01, 0.0, 0.01)])])
+    assert (memory.radii > 0.05).all()
+
+
+def test_the_sign_and_way_around_do_not_matter():
+    outline = outline_of(on_circle(0.05, 0.0, 120.0, 240.0))
+    s = np.array([0.01, 0.02])
+    np.testing.assert_allclose(outline.way(s, s + 3.0 * outline.length), 0.0, atol=1e-12)
+    np.testing.assert_allclose(outline.way(s, s - 0.004), -0.004, atol=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [(-6.0, -77.0, -163.0), (-163.0, -77.0, -6.0)])
+def test_balanced_places_have_no_net_force_and_moment_whatever_the_order(degrees):
+    outline = outline_of(on_circle(0.05, *degrees))
+    s = outline.locate((0.05 + TIP) * directions(np.radians(degrees)) @ outline.frame[:, :2].T)
+    cost, places = outline.balanced(s)
+    theta, x = outline.at(places[cost.argmin()])
+    n = directions(theta)
+    assert np.abs(n.sum(axis=0)).max() < 1e-9
+    assert abs((n[:, 0] * x[:, 1] - n[:, 1] * x[:, 0]).sum()) < 1e-4
+    order = np.argsort(places[cost.argmin()])
+    np.testing.assert_array_equal(order, np.argsort(s))
+
+
+def test_balance_on_a_face_is_found_along_the_face():
+    """Two edges and a face of a hexagon-like outline: the moment is balanced on the face."""
+    flat = on_square(0.05, 0.0, ("side", 0, -0.04), ("side", 0, 0.04))
+    round_side = on_circle(0.05, 110.0, 130.0, 230.0, 250.0)
+    outline = outline_of(flat, round_side)
+    s = outline.locate(
+        np.array([[0.05 + TIP, 0.03], [-0.03, 0.05], [-0.03, -0.05]]) @ outline.frame[:, :2].T
+    )
+    cost, places = outline.balanced(s)
+    theta, x = outline.at(places[cost.argmin()])
+    n = directions(theta)
+    assert abs((n[:, 0] * x[:, 1] - n[:, 1] * x[:, 0]).sum()) < 5e-4
+
+
+def test_one_ball_is_a_circle_around():
+    c, R = np.array([[0.01, 0.02]]), np.array([0.03])
+    outline = Outline.around(c, R, np.eye(3)[:2], TIP, np.zeros(1))
+    theta, x = outline.at(np.array([0.0, 0.1]))
+    np.testing.assert_allclose(x, c + R * directions(theta), atol=1e-12)
+
+
+def test_points_that_a_fresh_touch_contradicts_are_forgotten():
+    """The object moves by 2 mm: old points on the sides touched anew go, the others stay."""
+    old = on_circle(0.05, 0.0, 120.0, 180.0)
+    new = on_circle(0.05, 0.0, 180.0, center=(0.002, 0.0))
+    memory = SurfaceMemory.of([old, new])
+    assert memory.probes.tolist() == [0, 1, 1]
+    np.testing.assert_allclose(memory.normals[0], [-0.5, np.sqrt(0.75), 0.0])
+
+
+def test_misses_leave_no_trace():
+    first = on_circle(0.04, 0.0, 120.0, 240.0)
+    missed = Touch(first.q_target, Missed(Miss.NO_TOUCH, "finger_1"))
+    with_miss, without = SurfaceMemory.of([first, missed]), SurfaceMemory.of([first])
+    np.testing.assert_array_equal(with_miss.positions, without.positions)
+
+
+def test_a_memory_needs_a_touch():
     with pytest.raises(InputError, match="nothing has been felt yet"):
-        SurfaceMemory.of([missed])
+        SurfaceMemory.of([Touch(np.zeros(2), Missed(Miss.NO_TOUCH, "finger_1"))])
+
+
+def test_the_axis_is_that_of_the_sides_though_ends_were_felt_often():
+    side = on_circle(0.05, 0.0, 130.0, 200.0)
+    contacts = [Contact([0.0, 0.0, 0.06], UP), *side.felt.contacts[1:]]
+    end = Touch(side.felt.q, dataclasses.replace(side.felt, contacts=tuple(contacts)))
+    memory = SurfaceMemory.of([side] + 5 * [end])
+    np.testing.assert_allclose(memory.axis(end.felt), UP, atol=10 * UNDECIDED)
+
+
+# --- the form -------------------------------------------------------------------------------
+
+
+def probed(scene, first, probes, stack=None):
+    """A trial of the form from a grasp."""
+    trial = Trial(scene, stack or stack_of("fmk"), form="memory", probes=probes, start=first)
+    return trial.run((616, 0))
+
+
+@pytest.fixture(scope="module")
+def cylinder():
+    return Scene()
+
+
+@pytest.fixture(scope="module")
+def hexagon():
+    return Scene(object=HEXAGON)
+
+
+@pytest.fixture(scope="module")
+def first(cylinder):
+    return Trial(cylinder, stack_of("fmk"), form="memory", probes=1).run((616, 0)).grasps[0]
+
+
+@pytest.fixture(scope="module")
+def first_on_hexagon(hexagon):
+    return Trial(hexagon, stack_of("fmk"), form="memory", probes=1).run((777, 1)).grasps[0]
+
+
+def test_steps_are_certified_within_limits_and_the_same_each_time(cylinder, first):
+    controller = Controller(cylinder.articulated, stack_of("fmk"), "memory")
+    history = [Touch(first.q, first)]
+    step, again = controller.step(history), controller.step(history)
+    assert step.q_target.tobytes() == again.q_target.tobytes()
+    assert [level.name for level in step.solution.levels] == [
+        "step",
+        "range",
+        "contact",
+        "force",
+        "moment",
+        "way",
+        "kinematic",
+    ]
+    assert cylinder.articulated.violation(step.q_target) == 0.0
+
+
+def test_secant_levels_ask_exactly_for_the_predicted_motion(cylinder, first):
+    """A step that moves the contacts as predicted meets contact, force, moment and way."""
+    aim = Aim.each(SurfaceMemory.of([Touch(first.q, first)]), first)[0]
+    aimed, below = aim.levels(stack_of("fmk"), 0.3)
+    motion, _ = aim.predicted(0.3)
+    x = np.linalg.lstsq(first.jacobian, motion.ravel(), rcond=None)[0]
+    assert [level.name for level in below] == ["kinematic"]
+    for level in aimed:
+        np.testing.assert_allclose(level.A @ x, level.upper, atol=1e-9)
+
+
+def test_the_whole_way_leads_to_balance(cylinder, first):
+    aim = Aim.each(SurfaceMemory.of([Touch(first.q, first)]), first)[0]
+    motion, normals = aim.predicted(1.0)
+    centers = cylinder.articulated.centers(first.q) + motion
+    np.testing.assert_allclose(normals.sum(axis=0), 0.0, atol=3 * TURNED)
+    x = centers - TIP * normals
+    moment = np.cross(normals, x - x.mean(axis=0)).sum(axis=0)
+    np.testing.assert_allclose(moment, 0.0, atol=1e-3)
+
+
+def test_a_stored_history_is_continued_bit_for_bit(hexagon, first_on_hexagon, tmp_path):
+    robot, probe = hexagon.articulated, GeometricProbe(hexagon)
+    controller = Controller(robot, stack_of("fmk"), "memory", budget=9)
+
+    def walked(history):
+        while (step := controller.step(history)).q_target is not None:
+            history = [*history, Touch(step.q_target, probe.touch(step.q_target))]
+        return history
+
+    whole = walked([Touch(first_on_hexagon.q, first_on_hexagon)])
+    for stop in (1, 4, 8):
+        save_history(tmp_path / "h.json", whole[:stop])
+        resumed = walked(load_history(tmp_path / "h.json"))
+        assert [t.q_target.tobytes() for t in resumed] == [t.q_target.tobytes() for t in whole]
+
+
+def test_three_contacts_on_one_face_find_their_way_around(hexagon, first_on_hexagon):
+    """All normals parallel, f ≠ 0: a stationary point of the force law, and no grasp."""
+    side = HEXAGON.polygon
+    middle = 0.5 * (np.array(side[2]) + np.array(side[3]))
+    outward = middle / np.linalg.norm(middle)
+    tangent = np.array([-outward[1], outward[0]])
+    places = middle + np.outer([-0.015, 0.015, 0.0], tangent)
+    contacts = [
+        Contact([*(np.array(hexagon.position[:2]) + p), hexagon.position[2]], [*outward, 0.0])
+        for p in places
+    ]
+    grasp = hexagon.articulated.grasp(first_on_hexagon.q, contacts)
+    plain = Controller(hexagon.articulated, stack_of("f"), "hierarchy", landing=False)
+    history = [Touch(grasp.q, grasp)]
+    still = plain.step(history).plan.x
+    moving = (
+        Controller(hexagon.articulated, stack_of("fm"), "memory", landing=False)
+        .step(history)
+        .plan.x
+    )
+    assert np.abs(grasp.jacobian @ still).max() < 1e-9
+    assert np.abs(grasp.jacobian @ moving).max() > 5e-3
+
+
+def test_a_finger_on_an_edge_is_settled_there():
+    """A pentagon's faces do not balance: it takes edges, and they are found and kept."""
+    scene = Scene(object=Prism.regular(5, 0.06))
+    record = Trial(scene, stack_of("fmk"), form="memory", probes=25).run((777, 0))
+    assert record.converged_at is not None and record.converged_at <= 20
+    n = record.grasps[-1].normals
+    corners = np.array(scene.object.polygon)
+    edges = np.roll(corners, -1, axis=0) - corners
+    faces = np.arctan2(-edges[:, 0], edges[:, 1])
+    off = np.abs(wrapped(np.arctan2(n[:, 1], n[:, 0])[:, None] - faces)).min(axis=1)
+    assert (off > 0.02).any()
+
+
+def test_an_object_that_moves_by_two_millimetres_is_grasped_again(cylinder, first):
+    robot = cylinder.articulated
+    moved = Scene(position=(0.722, 0.0, 0.2))
+    controller = Controller(robot, stack_of("fmk"), "memory")
+    history = [Touch(first.q, first)]
+    for scene, touches in ((cylinder, 10), (moved, 15)):
+        probe = GeometricProbe(scene)
+        for _ in range(touches):
+            q = controller.step(history).q_target
+            history.append(Touch(q, probe.touch(q)))
+        grasp = history[-1].felt
+        assert ForceTask().potential(grasp) <= FORCE_GOAL
+        assert MomentTask().potential(grasp) <= MOMENT_GOAL
+    # Where the object was held when it moved, it was touched anew: nothing old is left there.
+    left = set(SurfaceMemory.of(history).probes.tolist())
+    assert not left & set(range(6, 11)) and set(range(15, 26)) <= left
+
+
+def test_a_balanced_grasp_is_kept_once_a_step_from_it_missed(cylinder, first):
+    stack = stack_of("fmk")
+    record = probed(cylinder, first, 6)
+    good = record.grasps[-1]
+    history = [Touch(first.q, first), Touch(good.q, good)]
+    assert way_back(stack, history, None) is None
+    history.append(Touch(good.q + 0.1, Missed(Miss.NO_TOUCH, "finger_1")))
+    np.testing.assert_array_equal(way_back(stack, history, None), good.q)
+    history.append(Touch(good.q, first))  # it is not there any more
+    assert way_back(stack, history, None) is None
+
+
+def test_the_best_grasp_is_returned_to_as_the_budget_runs_out(cylinder, first):
+    stack = Controller(cylinder.articulated, stack_of("fmk"), "memory").stack
+    record = probed(cylinder, first, 3)
+    better, worse = record.grasps[1], record.grasps[0]
+    history = [Touch(better.q, better), Touch(worse.q, worse)]
+    assert way_back(stack, history, 30) is None
+    np.testing.assert_array_equal(way_back(stack, history, 1), better.q)
+
+
+def test_stacks_without_force_and_moment_are_the_plain_hierarchy(cylinder, first):
+    history = [Touch(first.q, first)]
+    steps = [
+        Controller(cylinder.articulated, stack_of("k"), form).step(history).q_target
+        for form in ("memory", "hierarchy")
+    ]
+    assert steps[0].tobytes() == steps[1].tobytes()
+
+
+def test_other_cylinders_need_no_radius_of_their_own():
+    scene = Scene(object=Cylinder(radius=0.065))
+    record = Trial(scene, stack_of("fmk"), form="memory", probes=12).run((777, 0))
+    assert record.converged_at is not None and record.converged_at <= 8
 
 
 def test_on_an_irregular_prism_only_the_memory_finds_balance():
