@@ -40,8 +40,9 @@ from hqp_grasp.tasks import (
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.touch.sensing import sense
+from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.objects import Body, Cylinder, Prism
-from hqp_grasp.world.robot import Robot, RobotDescription
+from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
 __all__ = [

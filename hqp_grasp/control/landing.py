@@ -18,18 +18,19 @@ LANDING_DAMPING = 1e-2  # [m/rad] tips that move less than this with the joints 
 def land(robot: Robot, stack: Stack, grasp: Grasp, x: np.ndarray) -> np.ndarray:
     """Correct x (n,) [rad] until the fingertips arrive where J x puts them, within the limits."""
     limits = stack.limit_levels(grasp)
-    goal = robot.centers(grasp.q).ravel() + grasp.jacobian @ x
+    points = robot.points(grasp)
+    goal = robot.centers(grasp.q, points).ravel() + grasp.jacobian @ x
     damping = LANDING_DAMPING * np.eye(grasp.n)
     hqp = HQP("active-set")
     for _ in range(LANDING_STEPS):
-        rest = goal - robot.centers(grasp.q + x).ravel()
+        rest = goal - robot.centers(grasp.q + x, points).ravel()
         if np.abs(rest).max() < LANDED:
             break
         levels = [
             Level(v.A, np.minimum(v.lower - v.A @ x, 0.0), np.maximum(v.upper - v.A @ x, 0.0))
             for v in limits
         ]
-        A = np.concatenate([robot.jacobian(grasp.q + x), damping])
+        A = np.concatenate([robot.jacobian(grasp.q + x, points), damping])
         b = np.concatenate([rest, np.zeros(grasp.n)])
         x = x + hqp.solve([*levels, Level.equal(A, b, "landing")]).x
     return x

@@ -76,6 +76,8 @@ class Start:
         `probe_in` gives the probe that touches in a scene.
         """
         robot = scene.articulated
+        if self == Start() and robot.description.start:
+            return replace(self, **robot.description.start).draw(scene, probe_in, rng)
         last = "none"
         for rejected in range(self.max_draws):
             adduction = rng.uniform(*self.adduction)
@@ -186,7 +188,7 @@ def _open_hand(robot: Robot, adduction: float) -> tuple[np.ndarray, list[int]] |
     """
     q = np.clip(robot.home, robot.q_lower, robot.q_upper)
     fixed = [j for joints in robot.flexion for j in joints]
-    q[fixed] = robot.q_lower[fixed]
+    q = robot.opened(q)
     if robot.description.adduction is not None:
         spread = robot.index(robot.description.adduction)
         if not robot.q_lower[spread] <= adduction <= robot.q_upper[spread]:
@@ -199,10 +201,9 @@ def _open_hand(robot: Robot, adduction: float) -> tuple[np.ndarray, list[int]] |
 def _reach(robot: Robot, q: np.ndarray) -> float:
     """How far before the palm every fingertip can get while it closes from q (n,) [m]."""
     p_palm, R_palm = robot.palm(q)
-    q, farthest = q.copy(), np.full(len(robot.flexion), -np.inf)
-    flexion = [j for joints in robot.flexion for j in joints]
+    farthest = np.full(len(robot.flexion), -np.inf)
     for share in np.linspace(0.0, 1.0, CLOSINGS):
-        q[flexion] = (1.0 - share) * robot.q_lower[flexion] + share * robot.q_upper[flexion]
+        q = robot.opened(q, share)
         ahead = (robot.centers(q) - p_palm) @ R_palm[:, 2] + robot.tip_radius
         farthest = np.maximum(farthest, ahead)
     return float(farthest.min())
@@ -222,7 +223,7 @@ def _placed(
     robot = scene.articulated
     p_palm = place.position(np.array(scene.position))
     R_palm = place.rotation(robot.palm(robot.home)[1])
-    if not robot.description.arm:
+    if not robot.arm:
         p_now, R_now = robot.palm(q)
         turn = R_palm @ R_now.T
         return scene.rebased(p_palm - turn @ p_now, turn), q

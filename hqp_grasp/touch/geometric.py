@@ -1,10 +1,9 @@
-"""Touching by geometry: open, move, close each finger until its tip meets the object."""
+"""Touching by geometry: open, move, close each finger until its link meets the object."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
-from itertools import count
 
 import mujoco
 import numpy as np
@@ -12,22 +11,49 @@ import numpy as np
 from hqp_grasp.errors import InputError, one_of
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
 from hqp_grasp.world.objects import OBJECT
+from hqp_grasp.world.robot import CAPSULE, SPHERE
 from hqp_grasp.world.scene import Scene
 
 RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves
-TOUCH = 1e-9  # [m] gap at which a tip touches
+TOUCH = 1e-9  # [m] gap at which a ball touches
+# Two meshes at gap 0 have no direction between them: there a touch ends within these gaps.
+CLOSE = (1e-9, 1e-8)  # [m]
 OVERLAP = 1e-7  # [m] a link this deep in the object touches it
 NEAR = 5e-3  # [m] gap below which Newton's method finds the touch
 MAX_CLOSING_STEPS = 2000  # tens, but for tips that graze
 REACH = 0.5  # [m] gaps beyond this are not measured
+ALL_THE_WAY = 100.0  # [rad] more than any range
+
+
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """Where a link and the object are nearest to one another."""
+
+    gap: float  # [m] negative inside
+    link: np.ndarray  # (3,) [m] of the link's surface, world
+    normal: np.ndarray  # (3,) outward from the object
+    radius: float  # [m] that the link is rounded by there
+
+
+@dataclass
+class _Finger:
+    """One finger on its way: q(s) = clip(q_target + s·way)."""
+
+    way: np.ndarray  # (n,) signed; its fastest joint moves by 1 rad while s grows by 1
+    s: float = 0.0  # [rad]
+    gap: float = np.inf
+    free: float = -np.inf  # the largest s known to touch nothing
+    inside: float = np.inf  # the smallest s known to be inside
 
 
 @dataclass(frozen=True, eq=False)
 class GeometricProbe:
-    """Touch without dynamics: exact distances between the tips and the object, from MuJoCo.
+    """Touch without dynamics: exact distances between links and object, from MuJoCo.
 
-    The hand moves to q_target with its flexions opened by RETREAT; then each finger closes along
-    its flexion to the first touch, to TOUCH or better. Closing overwrites the flexions.
+    The hand moves to q_target with its fingers opened by RETREAT; then each closes, its joints in
+    the proportion that the robot's description gives, to the first touch. A finger of several
+    joints then feels the normal, opens again and closes along w = −(nᵀJ_γ)⁺, which changes its
+    shape least. Closing overwrites the flexions.
 
     Other links feel the object too: a touch with one of them in it is a Missed. In the paper's
     simulation the object is felt with the fingertips only; with `links="pass"` the others pass
@@ -39,30 +65,25 @@ class GeometricProbe:
     scene: Scene
     links: str = "block"  # or "pass"
     _local: threading.local = field(init=False, repr=False)  # each thread's own MjData
-    _tips: np.ndarray = field(init=False, repr=False)  # geom ids (k,)
     _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch
     _objects: tuple[int, ...] = field(init=False, repr=False)  # geom ids of what is felt
-    _speed: np.ndarray = field(init=False, repr=False)  # (k,) [m/rad] no tip closes faster
+    _round: tuple[bool, ...] = field(init=False, repr=False)  # each contact point is one ball
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         one_of("links", self.links, ("pass", "block"))
         robot, model = self.scene.articulated, self.scene.model
-        for point, joints in zip(robot.description.contact_points, robot.flexion, strict=True):
-            if len(joints) != 1:
-                raise InputError(
-                    f"{point.name} has {len(joints)} flexion joints; "
-                    "the geometric probe closes one joint a finger"
-                )
+        for point, way in zip(robot.description.contact_points, robot.closing, strict=True):
+            if not way.any():
+                raise InputError(f"{point.name} has no flexion joint, and so cannot close")
         put("_local", threading.local())
-        tips = [model.geom(p.geom).id for p in robot.description.contact_points]
-        put("_tips", np.array(tips))
+        put("_round", tuple(bool(radius > 0.0) for radius in robot.tip_radius))
         touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        tips = {g for geoms in robot.geoms for g in geoms}
         objects = touching & (model.geom_bodyid == model.body(OBJECT).id)
         put("_objects", tuple(int(g) for g in np.flatnonzero(objects)))
         links = [g for g in np.flatnonzero(touching & ~objects) if g not in tips]
         put("_links", np.array(links, dtype=int))
-        put("_speed", self._speed_bound())
 
     @property
     def _data(self) -> mujoco.MjData:
@@ -70,56 +91,19 @@ class GeometricProbe:
             self._local.data = mujoco.MjData(self.scene.model)
         return self._local.data
 
-    def _speed_bound(self) -> np.ndarray:
-        # A tip turns about each joint that its flexion drives, at most at that joint's distance
-        # with the finger stretched: sum ratio × distance over the range's sampled postures.
-        robot = self.scene.articulated
-        fastest = np.zeros(len(self._tips))
-        for share in np.linspace(0.0, 1.0, 25):
-            q = robot.home.copy()
-            for (j,) in robot.flexion:
-                q[j] = robot.q_lower[j] + share * (robot.q_upper[j] - robot.q_lower[j])
-            J = robot.jacobian(q).reshape(len(self._tips), 3, -1)
-            for i, (j,) in enumerate(robot.flexion):
-                fastest[i] = max(fastest[i], np.linalg.norm(J[i, :, j]))
-        return 1.1 * fastest
-
     def touch(self, q_target: np.ndarray) -> Grasp | Missed:
         """Move to q_target (n,) [rad], close every finger, and return the grasp felt there."""
-        robot, data = self.scene.articulated, self._data
-        q = robot.require_q("q_target", q_target).copy()
-        flexion = [j for (j,) in robot.flexion]
-        q[flexion] = np.maximum(robot.q_lower[flexion], q[flexion] - RETREAT)
-        robot.place(data, q)
-        gaps = [self._gap(i) for i in range(len(flexion))]
-        if min(gaps) < 0.0:
-            q[flexion] = robot.q_lower[flexion]
-            robot.place(data, q)
-            gaps = [self._gap(i) for i in range(len(flexion))]
-            if min(gaps) < 0.0:
-                return self._missed(Miss.INSIDE, int(np.argmin(gaps)))
-        for _ in range(MAX_CLOSING_STEPS):
-            moving = [i for i, gap in enumerate(gaps) if abs(gap) > TOUCH]
-            if not moving:
-                break
-            J = None
-            for i in moving:
-                j = flexion[i]
-                if q[j] >= robot.q_upper[j] and gaps[i] > 0.0:
-                    return self._missed(Miss.NO_TOUCH, i)
-                step = gaps[i] / self._speed[i]  # cannot pass the first touch
-                if gaps[i] < NEAR:
-                    if J is None:
-                        J = robot.jacobian(q).reshape(len(flexion), 3, -1)
-                    closing = -float(self._normal(i) @ J[i, :, j])
-                    if closing > 0.05 * self._speed[i]:
-                        step = gaps[i] / closing
-                q[j] = min(q[j] + step, robot.q_upper[j])
-            robot.place(data, q)
-            for i in moving:
-                gaps[i] = self._gap(i)
-        else:
-            return self._missed(Miss.NO_TOUCH, moving[0])
+        robot = self.scene.articulated
+        q_target = robot.require_q("q_target", q_target).copy()
+        found = self._close(q_target, list(robot.closing))
+        if isinstance(found, Missed):
+            return found
+        again = self._aimed(q_target, *found)
+        if again is not None:
+            pressed = self._close(q_target, again)
+            found = found if isinstance(pressed, Missed) else pressed
+        q = found[0]
+        robot.place(self._data, q)
         others = tuple(
             self.scene.model.geom(int(link)).name
             for link in self._links
@@ -128,6 +112,108 @@ class GeometricProbe:
         if others and self.links == "block":
             return Missed(Miss.OTHER_LINK, others[0])
         return self._grasp(q, others)
+
+    def _close(
+        self, q_target: np.ndarray, ways: list[np.ndarray]
+    ) -> tuple[np.ndarray, list[_Finger]] | Missed:
+        """Open by RETREAT, then close every finger its way: the posture that touches."""
+        robot = self.scene.articulated
+        fingers = [_Finger(way, -RETREAT) for way in ways]
+        q = self._posture(q_target, fingers)
+        self._measure(q, fingers, range(len(fingers)))
+        if min(f.gap for f in fingers) < 0.0:
+            for f in fingers:
+                f.s, f.free, f.inside = self._end(q_target, -f.way), -np.inf, np.inf
+            q = self._posture(q_target, fingers)
+            self._measure(q, fingers, range(len(fingers)))
+            if min(f.gap for f in fingers) < 0.0:
+                return self._missed(Miss.INSIDE, int(np.argmin([f.gap for f in fingers])))
+        speed = [
+            float(np.abs(f.way) @ reach) for f, reach in zip(fingers, robot.reach, strict=True)
+        ]
+        ends = [-self._end(q_target, f.way) for f in fingers]
+        for _ in range(MAX_CLOSING_STEPS):
+            moving = [i for i, f in enumerate(fingers) if not self._touches(i, f.gap)]
+            if not moving:
+                return q, fingers
+            for i in moving:
+                f = fingers[i]
+                if f.s >= ends[i] and f.gap > 0.0:
+                    return self._missed(Miss.NO_TOUCH, i)
+                goal = f.gap - (0.0 if self._round[i] else sum(CLOSE) / 2.0)
+                step = goal / speed[i]  # cannot pass the first touch
+                if f.gap < NEAR:
+                    closing = self._closing_speed(q, i, f.way)
+                    if closing > 0.05 * speed[i]:
+                        step = goal / closing
+                s = f.s + step
+                if not f.free < s < f.inside:
+                    s = (f.free + f.inside) / 2.0
+                f.s = min(s, ends[i])
+            q = self._posture(q_target, fingers)
+            self._measure(q, fingers, moving)
+        return self._missed(Miss.NO_TOUCH, moving[0])
+
+    def _aimed(
+        self, q_target: np.ndarray, q: np.ndarray, fingers: list[_Finger]
+    ) -> list[np.ndarray] | None:
+        """The ways that change the fingers least, or None where the described ones are these."""
+        robot = self.scene.articulated
+        ways = []
+        for i, f in enumerate(fingers):
+            gamma = robot.flexion[i]
+            way = f.way
+            if len(gamma) > 1 and abs(f.s) <= RETREAT:
+                near = self._nearest(i)
+                J = self._jacobian(q, i, near.link)[:, gamma]
+                aimed = -(near.normal @ J)
+                if np.abs(aimed).max() > 0.0:
+                    way = np.zeros_like(f.way)
+                    way[list(gamma)] = aimed / np.abs(aimed).max()
+            ways.append(way)
+        same = all(np.array_equal(way, f.way) for way, f in zip(ways, fingers, strict=True))
+        return None if same else ways
+
+    def _touches(self, i: int, gap: float) -> bool:
+        return abs(gap) <= TOUCH if self._round[i] else CLOSE[0] <= gap <= CLOSE[1]
+
+    def _posture(self, q_target: np.ndarray, fingers: list[_Finger]) -> np.ndarray:
+        robot = self.scene.articulated
+        q = q_target.copy()
+        for f in fingers:
+            moving = f.way != 0.0
+            moved = q_target[moving] + f.s * f.way[moving]
+            q[moving] = np.clip(moved, robot.q_lower[moving], robot.q_upper[moving])
+        robot.place(self._data, q)
+        return q
+
+    def _end(self, q_target: np.ndarray, way: np.ndarray) -> float:
+        """−s at which the last joint of a finger reaches its range, going `way`."""
+        robot = self.scene.articulated
+        moving = way != 0.0
+        room = np.where(way > 0.0, robot.q_upper - q_target, robot.q_lower - q_target)[moving]
+        return -min(ALL_THE_WAY, float((room / way[moving]).max()))
+
+    def _measure(self, q: np.ndarray, fingers: list[_Finger], which: object) -> None:
+        for i in which:  # type: ignore[attr-defined]
+            f = fingers[i]
+            f.gap = min(self._distance(g, REACH) for g in self.scene.articulated.geoms[i])
+            if f.gap < 0.0:
+                f.inside = min(f.inside, f.s)
+            else:
+                f.free = max(f.free, f.s)
+
+    def _closing_speed(self, q: np.ndarray, i: int, way: np.ndarray) -> float:
+        """[m/rad] at which the gap of contact point i shrinks."""
+        near = self._nearest(i)
+        return -float(near.normal @ self._jacobian(q, i, near.link) @ way)
+
+    def _jacobian(self, q: np.ndarray, i: int, x: np.ndarray) -> np.ndarray:
+        """∂x/∂q (3, n) [m/rad] of a point of link i that is at x (3,) [m], world."""
+        robot = self.scene.articulated
+        points = np.zeros((len(robot.geoms), 3))
+        points[i] = robot.on_link(q, i, x)
+        return robot.jacobian(q, points)[3 * i : 3 * i + 3]
 
     def _missed(self, reason: Miss, i: int) -> Missed:
         return Missed(reason, self.scene.articulated.description.contact_points[i].name)
@@ -148,23 +234,29 @@ class GeometricProbe:
                     ends[:] = found
         return nearest
 
-    def _gap(self, i: int) -> float:
-        return self._distance(int(self._tips[i]), REACH)
-
-    def _normal(self, i: int) -> np.ndarray:
-        """Outward normal of the object where tip i is nearest, (3,).
-
-        At zero gap the two nearest points coincide and give no direction, the tip's centre does.
-        """
-        ends = np.zeros(6)
-        self._distance(int(self._tips[i]), REACH, ends)
-        away = self._data.geom_xpos[self._tips[i]] - ends[3:]
-        return away / np.linalg.norm(away)
+    def _nearest(self, i: int) -> _Near:
+        """Where contact point i is nearest to the object."""
+        model, data = self.scene.model, self._data
+        found = []
+        for geom in self.scene.articulated.geoms[i]:
+            ends = np.zeros(6)
+            found.append((self._distance(geom, REACH, ends), geom, ends[:3], ends[3:]))
+        gap, geom, link, thing = min(found, key=lambda near: near[0])
+        kind, radius = model.geom_type[geom], 0.0
+        if kind in (SPHERE, CAPSULE):
+            # At zero gap the nearest points coincide and give no direction; the centre does.
+            centre, radius = data.geom_xpos[geom], float(model.geom_size[geom, 0])
+            if kind == CAPSULE:
+                axis, half = data.geom_xmat[geom].reshape(3, 3)[:, 2], model.geom_size[geom, 1]
+                centre = centre + np.clip((thing - centre) @ axis, -half, half) * axis
+            away = centre - thing
+            normal = away / np.linalg.norm(away)
+            return _Near(gap, centre - radius * normal, normal, radius)
+        away = (link - thing) * (1.0 if gap > 0.0 else -1.0)
+        return _Near(gap, link, away / np.linalg.norm(away), radius)
 
     def _grasp(self, q: np.ndarray, others: tuple[str, ...]) -> Grasp:
         robot = self.scene.articulated
-        contacts = []
-        for center, radius, i in zip(robot.centers(q), robot.tip_radius, count(), strict=False):
-            normal = self._normal(i)
-            contacts.append(Contact(center - radius * normal, normal))
+        near = [self._nearest(i) for i in range(len(robot.geoms))]
+        contacts = [Contact(v.link, v.normal, tip_radius=v.radius) for v in near]
         return robot.grasp(q, contacts, others)

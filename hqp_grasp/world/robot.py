@@ -1,106 +1,35 @@
-"""A robot as data: an MJCF, its independent joints, and the points it touches with."""
+"""A described robot, compiled: its independent joints, and how the points it touches with move."""
 
 from __future__ import annotations
 
-import difflib
 import threading
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, ModelError, number, one_of
+from hqp_grasp.errors import InputError, ModelError
 from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.world.description import (
+    SLIDE_SPEED,
+    SPEED,
+    ContactPoint,
+    RobotDescription,
+    ball_name,
+    nearest,
+)
 
+SPHERE, CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+CONVEX = [SPHERE, CAPSULE] + [
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
+    for kind in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")
+]
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
-# What a robot.toml may say, and what of each contact point. A description is for people; force and
-# torque name sensors, which nothing here reads yet.
-ENTRIES = ("model", "description", "home", "palm", "arm", "adduction", "velocity", "contact_points")
-POINT_ENTRIES = ("name", "site", "geom", "flexion", "force", "torque")
+PARALLEL = 0.7  # [–] cosine of two joint axes that bend a finger alike
+SLIDE_UNIT = 0.06  # [m] a slide closes by while a hinge closes by 1 rad
 CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
-
-
-@dataclass(frozen=True)
-class ContactPoint:
-    """A place on the hand that may touch: a round tip, its site at the centre."""
-
-    name: str
-    site: str
-    geom: str
-    flexion: tuple[str, ...]  # joints that press it
-
-
-@dataclass(frozen=True)
-class RobotDescription:
-    """What a robot folder says in its robot.toml, beside its MJCF."""
-
-    name: str
-    xml: Path
-    home: str  # keyframe
-    palm: str  # site: z is the approach axis, x the opposition axis
-    arm: tuple[str, ...]  # joints that carry the hand
-    adduction: str | None  # joint that spreads the fingers
-    velocity: Mapping[str, float]  # [rad/s] of each independent joint
-    contact_points: tuple[ContactPoint, ...]
-
-    @classmethod
-    def load(cls, robot: str | Path) -> RobotDescription:
-        """Read a robot of this package by name, or any folder with a robot.toml by its path."""
-        if isinstance(robot, Path) or "/" in str(robot):
-            folder = Path(robot)
-            if not (folder / "robot.toml").is_file():
-                raise ModelError(f"{folder} is no robot folder: it has no robot.toml")
-        else:
-            root = Path(str(resources.files("hqp_grasp.robots")))
-            folder = root / one_of(
-                "robot", robot, sorted(p.parent.name for p in root.glob("*/*.toml"))
-            )
-        file = folder / "robot.toml"
-        try:
-            data = _entries(file, tomllib.loads(file.read_text()), ENTRIES)
-            points = tuple(
-                ContactPoint(
-                    _text(p["name"]), _text(p["site"]), _text(p["geom"]), _texts(p["flexion"])
-                )
-                for p in (_entries(file, p, POINT_ENTRIES) for p in data["contact_points"])
-            )
-            return cls(
-                name=folder.name,
-                xml=folder / data["model"],
-                home=_text(data["home"]),
-                palm=_text(data["palm"]),
-                arm=_texts(data["arm"]),
-                adduction=_text(data["adduction"]) if "adduction" in data else None,
-                velocity={j: number(f"velocity of {j}", v) for j, v in data["velocity"].items()},
-                contact_points=points,
-            )
-        except tomllib.TOMLDecodeError as error:
-            raise ModelError(f"{file} is not valid TOML: {error}") from error
-        except KeyError as error:
-            raise ModelError(f"{file} lacks the entry {error}") from error
-        except (TypeError, AttributeError, InputError) as error:
-            raise ModelError(f"{file}: an entry is of the wrong kind: {error}") from error
-
-    def spec(self) -> mujoco.MjSpec:
-        """The authored model, ready to be composed with others."""
-        try:
-            spec = mujoco.MjSpec.from_file(str(self.xml))
-        except ValueError as error:
-            raise ModelError(f"{self.xml} is not a valid MJCF: {error}") from error
-        # MuJoCo fills a keyframe that is too short with zeros, without a word.
-        for key in spec.keys:
-            if 0 < len(key.qpos) < len(spec.joints):
-                raise ModelError(
-                    f"keyframe {key.name!r} of {self.xml.name} has {len(key.qpos)} angles; "
-                    f"the model has {len(spec.joints)} joints"
-                )
-        return spec
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,8 +53,15 @@ class Robot:
     velocity: np.ndarray = field(init=False)  # (n,) [rad/s]
     home: np.ndarray = field(init=False)  # (n,) [rad]
     flexion: tuple[tuple[int, ...], ...] = field(init=False)  # for each contact point, into q
-    tip_radius: np.ndarray = field(init=False)  # (k,) [m]
-    _sites: np.ndarray = field(init=False, repr=False)  # (k,)
+    closing: np.ndarray = field(init=False)  # (k, n) [rad] how q moves as a point closes, signed
+    arm: tuple[int, ...] = field(init=False)  # joints that carry the palm, into q
+    idle: np.ndarray = field(init=False)  # (n,) bool: moves no contact point, as the other arm's
+    geoms: tuple[tuple[int, ...], ...] = field(init=False)  # that touch, for each contact point
+    tip_radius: np.ndarray = field(init=False)  # (k,) [m] of a round tip, 0 for other shapes
+    reach: np.ndarray = field(init=False)  # (k, n) [m/rad] no point of a link moves faster
+    _points: np.ndarray = field(init=False, repr=False)  # (k, 3) [m] centres, link frames
+    _bodies: np.ndarray = field(init=False, repr=False)  # (k,) links
+    _palm: tuple[int, np.ndarray, np.ndarray] = field(init=False, repr=False)  # body, p, R
     _hinge: np.ndarray = field(init=False, repr=False)  # (N,) bool
     _ancestor: np.ndarray = field(init=False, repr=False)  # (k, N) bool: joint j moves point i
     _nearer_base: np.ndarray = field(init=False, repr=False)  # (N, N) bool: j at or above l
@@ -138,8 +74,13 @@ class Robot:
             if model.jnt_type[j] not in (HINGE, SLIDE):
                 raise ModelError(
                     f"joint {model.joint(j).name!r} of {about.name} is neither hinge nor slide; "
-                    "a robot here has a fixed base and one-dimensional joints"
+                    "a robot here has a fixed base and one-dimensional joints: "
+                    f'lock = ["{model.joint(j).name}"] fixes a free base'
                 )
+        put("_local", threading.local())
+        put("_hinge", model.jnt_type == HINGE)
+        # Joints are numbered from the base outwards, so the smaller number is nearer the base.
+        put("_nearer_base", np.triu(np.ones((model.njnt, model.njnt), dtype=bool)))
         names = [model.joint(j).name for j in range(model.njnt)]
         C, c0, independent = _couplings(model)
         put("coupling", C)
@@ -153,42 +94,163 @@ class Robot:
         q_lower, q_upper = _ranges_of_independent(C, c0, lower, upper)
         put("q_lower", q_lower)
         put("q_upper", q_upper)
-        for joint in (*about.arm, *about.velocity):
-            self.index(joint)
-        missing = [j for j in self.joints if j not in about.velocity]
-        if missing:
-            raise ModelError(f"robot.toml of {about.name} gives no velocity for {missing}")
-        velocity = np.array([about.velocity[j] for j in self.joints], dtype=float)
-        if not ((velocity > 0.0) & np.isfinite(velocity)).all():
-            raise ModelError(
-                f"robot.toml of {about.name}: every velocity must be finite and above 0"
-            )
-        put("velocity", velocity)
-        key = _id(model, mujoco.mjtObj.mjOBJ_KEY, about.home, "keyframe", about)
-        put("home", model.key_qpos[key][independent].copy())
-        _id(model, mujoco.mjtObj.mjOBJ_SITE, about.palm, "site", about)
+        self._refuse_stuck(names)
+        put("velocity", self._velocity(independent))
+        put("home", self._home(independent))
+        links = [_link(model, point, about) for point in about.contact_points]
+        put("_bodies", np.array([link.body for link in links]))
+        put("geoms", tuple(link.geoms for link in links))
+        put("_points", np.array([link.centre for link in links]))
+        put("tip_radius", np.array([link.radius for link in links]))
+        chains = [_chain(model, link.body) for link in links]
+        put("_ancestor", np.array([np.isin(np.arange(model.njnt), c) for c in chains]))
+        moves = self._ancestor @ (C != 0.0)  # (k, n)
+        put("idle", ~moves.any(axis=0))
+        put("reach", np.array([_reach(model, v) for v in links]) @ np.abs(C))
+        put("closing", self._closing(independent, moves))
+        put("flexion", tuple(tuple(np.flatnonzero(w).tolist()) for w in self.closing))
+        put("_palm", self._find_palm())
+        fingers = {j for joints in self.flexion for j in joints}
+        if about.hand.arm is None:
+            carries = C[_chain(model, self._palm[0])].any(axis=0)
+            arm = tuple(j for j in range(self.n) if carries[j] and j not in fingers)
+        else:
+            arm = tuple(self.index(joint) for joint in about.arm)
+        put("arm", arm)
         if about.adduction is not None:
             self.index(about.adduction)
-        points = about.contact_points
-        put("flexion", tuple(tuple(self.index(j) for j in p.flexion) for p in points))
-        sites = [_id(model, mujoco.mjtObj.mjOBJ_SITE, p.site, "site", about) for p in points]
-        geoms = [_id(model, mujoco.mjtObj.mjOBJ_GEOM, p.geom, "geom", about) for p in points]
-        for p, s, g in zip(points, sites, geoms, strict=True):
-            same = model.site_bodyid[s] == model.geom_bodyid[g]
-            if not same or np.abs(model.site_pos[s] - model.geom_pos[g]).max() > CENTRED:
-                raise ModelError(
-                    f"site {p.site!r} of {about.name} must be at the centre of its geom {p.geom!r}"
-                )
-            if model.geom_type[g] != int(mujoco.mjtGeom.mjGEOM_SPHERE):
-                raise ModelError(f"geom {p.geom!r} of {about.name} must be a sphere: a round tip")
-        put("_sites", np.array(sites))
-        put("tip_radius", model.geom_size[geoms, 0].copy())
-        put("_hinge", model.jnt_type == HINGE)
-        chains = [_chain(model, int(model.site_bodyid[s])) for s in sites]
-        put("_ancestor", np.array([np.isin(np.arange(model.njnt), c) for c in chains]))
-        # Joints are numbered from the base outwards, so the smaller number is nearer the base.
-        put("_nearer_base", np.triu(np.ones((model.njnt, model.njnt), dtype=bool)))
-        put("_local", threading.local())
+
+    def _refuse_stuck(self, names: Sequence[str]) -> None:
+        """Raise where couplings leave a joint no range, or a single angle."""
+        for j in np.flatnonzero(~(self.q_lower < self.q_upper)):
+            joint, low, high = self.joints[j], self.q_lower[j], self.q_upper[j]
+            driven = [
+                f"{names[i]} = {self.coupling[i, j]:g}·{joint} + {self.offset[i]:g} must stay in "
+                f"[{self.lower[i]:g}, {self.upper[i]:g}]"
+                for i in np.flatnonzero(self.coupling[:, j])
+                if names[i] != joint
+            ]
+            left = f"only the angle {low:g}" if low == high else "no angle at all"
+            raise ModelError(
+                f"couplings and ranges leave joint {joint!r} of {self.description.name} {left}"
+                + "".join(f"; {what}" for what in driven)
+                + f'; drop_couplings = ["{names[np.flatnonzero(self.coupling[:, j])[-1]]}"] frees '
+                "it, ranges or lock say otherwise"
+            )
+
+    def _velocity(self, independent: list[int]) -> np.ndarray:
+        about = self.description
+        for joint in about.velocity:
+            self.index(joint)
+        slides = self.model.jnt_type[independent] == SLIDE
+        default = np.where(slides, SLIDE_SPEED, SPEED) if about.speed is None else about.speed
+        velocity = np.full(self.n, default)
+        for joint, speed in about.velocity.items():
+            velocity[self.index(joint)] = speed
+        return velocity
+
+    def _home(self, independent: list[int]) -> np.ndarray:
+        model, about = self.model, self.description
+        name = about.home
+        if not name and any(model.key(i).name == "home" for i in range(model.nkey)):
+            name = "home"
+        if isinstance(name, str):
+            key = _id(model, mujoco.mjtObj.mjOBJ_KEY, name, "keyframe", about)
+            return model.key_qpos[key][independent].copy()
+        home = np.clip(model.qpos0[independent], self.q_lower, self.q_upper)
+        for joint, angle in name.items():
+            if joint in self.joints:  # the others follow
+                home[self.index(joint)] = angle
+        outside = (home < self.q_lower) | (home > self.q_upper)
+        if outside.any():
+            j = int(outside.argmax())
+            raise ModelError(
+                f"home of {about.name} puts {self.joints[j]!r} at {home[j]:g}, outside its range "
+                f"[{self.q_lower[j]:g}, {self.q_upper[j]:g}]"
+            )
+        return home
+
+    def _closing(self, independent: list[int], moves: np.ndarray) -> np.ndarray:
+        """How q moves as each contact point closes (k, n), its fastest joint by 1 rad."""
+        points = self.description.contact_points
+        unit = np.where(self._hinge[independent], 1.0, SLIDE_UNIT)
+        closing = np.zeros((len(points), self.n))
+        for i, point in enumerate(points):
+            if point.closing is None:
+                closing[i] = self._guessed_closing(i, independent, moves)
+            else:
+                for joint, weight in point.closing.items():
+                    closing[i, self.index(joint)] = weight
+            if closing[i].any():
+                closing[i] /= np.abs(closing[i] / unit).max()
+        for i, point in enumerate(points):
+            for j in np.flatnonzero(closing[i]):
+                others = [p.name for a, p in enumerate(points) if a != i and moves[a, j]]
+                if others:
+                    raise ModelError(
+                        f"joint {self.joints[j]!r} of {self.description.name} closes "
+                        f"{point.name!r} and moves {', '.join(map(repr, others))} too: each "
+                        "contact point needs joints of its own to close with"
+                    )
+        return closing
+
+    def _guessed_closing(self, i: int, independent: list[int], moves: np.ndarray) -> np.ndarray:
+        """The joints that bend a finger: those parallel to its last one, towards its wider side."""
+        point = self.description.contact_points[i]
+        own = [
+            j
+            for j in range(self.n)
+            if moves[i, j]
+            and moves[:, j].sum() == 1
+            and self.joints[j] != self.description.adduction
+        ]
+        if not own:
+            raise ModelError(
+                f"no joint of {self.description.name} moves {point.name!r} alone, so nothing can "
+                "close it; each contact point needs joints of its own"
+            )
+        weights = np.zeros(self.n)
+        axes = self._at(self.home).xaxis[independent]
+        last = own[-1]
+        low, high = self.q_lower[last], self.q_upper[last]
+        if self._hinge[independent[last]]:
+            towards = 1.0 if not low + high < 0.0 else -1.0
+            for j in own:
+                cosine = float(axes[j] @ axes[last])
+                if self._hinge[independent[j]] and abs(cosine) > PARALLEL:
+                    weights[j] = towards * np.sign(cosine)
+        else:
+            ends = self.home.copy(), self.home.copy()
+            ends[0][last], ends[1][last] = low, high
+            apart = [np.linalg.norm(x - x[i], axis=1).sum() for x in map(self.centers, ends)]
+            weights[last] = 1.0 if apart[1] < apart[0] else -1.0
+        return weights
+
+    def _find_palm(self) -> tuple[int, np.ndarray, np.ndarray]:
+        """Body of the palm, and where on it p (3,), R (3, 3): z approach axis, x opposition."""
+        model, hand = self.model, self.description.hand
+        if hand.palm is not None:
+            site = _id(
+                model, mujoco.mjtObj.mjOBJ_SITE, self.description.palm, "site", self.description
+            )
+            R = np.zeros(9)
+            mujoco.mju_quat2Mat(R, model.site_quat[site])
+            return int(model.site_bodyid[site]), model.site_pos[site].copy(), R.reshape(3, 3)
+        above = [_ancestors(model, body) for body in self._bodies]
+        body = next(b for b in above[0] if all(b in others for others in above))
+        half = self.home + 0.5 * np.clip(
+            self.closing.sum(axis=0), self.q_lower - self.home, self.q_upper - self.home
+        )
+        J = self.jacobian(half).reshape(len(above), 3, self.n)
+        data = self._at(half)
+        v = np.einsum("kaj,kj->ka", J, self.closing)
+        x = np.linalg.eigh(v.T @ v)[1][:, -1]
+        z = self.centers(half).mean(axis=0) - data.xpos[body]
+        z = z / np.linalg.norm(z) if np.linalg.norm(z) > 1e-6 else np.linalg.eigh(v.T @ v)[1][:, 0]
+        x = x - (x @ z) * z
+        x /= np.linalg.norm(x)
+        R = data.xmat[body].reshape(3, 3).T @ np.column_stack([x, np.cross(z, x), z])
+        return body, np.zeros(3), R
 
     def __repr__(self) -> str:
         return f"Robot({self.description.name!r})"
@@ -232,18 +294,21 @@ class Robot:
         data = self._at(q)
         return data.xpos.copy(), data.xquat.copy()
 
-    def jacobian(self, q: np.ndarray) -> np.ndarray:
-        """∂x/∂q (3k, n) [m/rad] of the contact points' centres."""
-        J = self._point_jacobian(self._at(q))
+    def jacobian(self, q: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+        """∂x/∂q (3k, n) [m/rad] of the contact points' centres, or of `points`.
+
+        `points` (k, 3) [m] stand in the links' frames, one on each contact point's link.
+        """
+        J = self._point_jacobian(self._at(q), points)
         return J.transpose(0, 2, 1).reshape(-1, self.model.njnt) @ self.coupling
 
-    def hessian(self, q: np.ndarray) -> np.ndarray:
-        """∂²x/∂q² (3k, n, n) [m/rad²] of the contact points' centres.
+    def hessian(self, q: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+        """∂²x/∂q² (3k, n, n) [m/rad²] of the contact points' centres, or of `points`.
 
         ∂²x/∂q_j∂q_l = ω_j × ∂x/∂q_l with j the joint nearer the base, ω = 0 for slides.
         """
         data = self._at(q)
-        J = self._point_jacobian(data)  # (k, N, 3)
+        J = self._point_jacobian(data, points)  # (k, N, 3)
         omega = data.xaxis * self._hinge[:, None]
         both = self._nearer_base[None, :, :, None] * _cross(omega[None, :, None], J[:, None, :])
         both *= self._ancestor[:, :, None, None]
@@ -254,31 +319,55 @@ class Robot:
         k, N = len(J), self.model.njnt
         return self.coupling.T @ H.reshape(3 * k, N, N) @ self.coupling
 
-    def _point_jacobian(self, data: mujoco.MjData) -> np.ndarray:
-        lever = data.site_xpos[self._sites][:, None, :] - data.xanchor[None]
+    def _point_jacobian(self, data: mujoco.MjData, points: np.ndarray | None) -> np.ndarray:
+        lever = self._world(data, points)[:, None, :] - data.xanchor[None]
         J = np.where(self._hinge[:, None], _cross(data.xaxis[None], lever), data.xaxis)
         return J * self._ancestor[:, :, None]
 
-    def centers(self, q: np.ndarray) -> np.ndarray:
-        """Centres of the contact points (k, 3) [m], world."""
-        return self._at(q).site_xpos[self._sites]
+    def _world(self, data: mujoco.MjData, points: np.ndarray | None) -> np.ndarray:
+        points = self._points if points is None else points
+        R = data.xmat[self._bodies].reshape(-1, 3, 3)
+        return data.xpos[self._bodies] + (R @ points[:, :, None])[:, :, 0]
+
+    def centers(self, q: np.ndarray, points: np.ndarray | None = None) -> np.ndarray:
+        """Centres of the contact points, or `points` of their links (k, 3) [m], world."""
+        return self._world(self._at(q), points)
+
+    def points(self, grasp: Grasp) -> np.ndarray:
+        """The places on the links (k, 3) [m] whose motion the grasp's Jacobian gives."""
+        if any(contact.point is None for contact in grasp.contacts):
+            return self._points
+        return np.array([contact.point for contact in grasp.contacts])
+
+    def on_link(self, q: np.ndarray, i: int, x: np.ndarray) -> np.ndarray:
+        """A place x (3,) [m], world, in the frame of contact point i's link."""
+        data, body = self._at(q), self._bodies[i]
+        return data.xmat[body].reshape(3, 3).T @ (x - data.xpos[body])
 
     def palm(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the palm is, p_palm (3,) [m] and R_world_palm (3, 3), world.
 
         Its z axis is the approach axis, its x axis the opposition axis.
         """
-        site = self._at(q).site(self.description.palm)
-        return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
+        data, (body, p, R) = self._at(q), self._palm
+        R_world_body = data.xmat[body].reshape(3, 3)
+        return data.xpos[body] + R_world_body @ p, R_world_body @ R
 
     def palm_jacobian(self, q: np.ndarray) -> np.ndarray:
         """The palm's velocity and angular velocity for each joint (6, n) [m/rad, –], world."""
         data = self._at(q)
         mujoco.mj_comPos(self.model, data)
         J = np.zeros((6, self.model.nv))
-        site = self.model.site(self.description.palm).id
-        mujoco.mj_jacSite(self.model, data, J[:3], J[3:], site)
+        mujoco.mj_jac(self.model, data, J[:3], J[3:], self.palm(q)[0], self._palm[0])
         return J @ self.coupling
+
+    def opened(self, q: np.ndarray) -> np.ndarray:
+        """q (n,) with every finger open as far as its joints' ranges let it."""
+        q = q.copy()
+        for w in self.closing:
+            end = np.where(w > 0.0, self.q_lower, self.q_upper)
+            q = np.where((w != 0.0) & np.isfinite(end), end, q)
+        return q
 
     def grasp(
         self, q: np.ndarray, contacts: Sequence[Contact], other_links: tuple[str, ...] = ()
@@ -286,8 +375,9 @@ class Robot:
         """A complete grasp from joint angles and what was felt there.
 
         `contacts` has one Contact for each contact point, in the description's order: position and
-        outward normal (world), perhaps wrench and confidence. Name, link, point and flexion are
-        the robot's, and so are the grasp's Jacobian, Hessian and coupling.
+        outward normal (world), perhaps wrench and confidence; on a link that is no ball, perhaps
+        the `tip_radius` it is rounded by there. Name, link, point and flexion are the robot's, and
+        so are the grasp's Jacobian, Hessian and coupling.
         """
         q = self.require_q("Robot.grasp: q", q)
         points = self.description.contact_points
@@ -296,29 +386,40 @@ class Robot:
                 f"{self.description.name} touches with {len(points)} points "
                 f"({', '.join(p.name for p in points)}); got {len(contacts)} contacts"
             )
-        model = self.model
-        complete = [
-            replace(
-                contact,
-                name=point.name,
-                body=model.body(int(model.site_bodyid[site])).name,
-                point=model.site_pos[site],
-                flexion=flexion,
-                tip_radius=float(radius),
+        places = self._points.copy()
+        complete = []
+        for i, (contact, point) in enumerate(zip(contacts, points, strict=True)):
+            radius = float(self.tip_radius[i])
+            if radius == 0.0:  # no ball: the touching point, or the centre of curvature there
+                radius = contact.tip_radius
+                places[i] = self.on_link(q, i, contact.position + radius * contact.normal)
+            complete.append(
+                replace(
+                    contact,
+                    name=point.name,
+                    body=self.model.body(int(self._bodies[i])).name,
+                    point=places[i],
+                    flexion=self.flexion[i],
+                    tip_radius=radius,
+                )
             )
-            for contact, point, site, flexion, radius in zip(
-                contacts, points, self._sites, self.flexion, self.tip_radius, strict=True
-            )
-        ]
         return Grasp(
             q=q,
             contacts=tuple(complete),
-            jacobian=self.jacobian(q),
-            hessian=self.hessian(q),
+            jacobian=self.jacobian(q, places),
+            hessian=self.hessian(q, places),
             coupling=self.coupling,
             offset=self.offset,
             other_links=other_links,
         )
+
+    @property
+    def workspace(self) -> tuple[float, float, float]:
+        """Where an object stands (3,) [m], world: as described, or amid the tips at home."""
+        about = self.description
+        where = self.centers(self.home).mean(axis=0) if about.workspace is None else about.workspace
+        x, y, z = (float(v) for v in where)
+        return x, y, z
 
     def violation(self, q: np.ndarray) -> float:
         """How far the worst joint, independent or coupled, is outside its range [rad]."""
@@ -336,30 +437,6 @@ class Robot:
                 f"{name} must be {self.n} finite angles, for {', '.join(self.joints)}; got {q!r}"
             )
         return array
-
-
-def _entries(file: Path, table: object, known: tuple[str, ...]) -> dict[str, Any]:
-    """Return `table`; raise for an entry that is not known, which would be ignored otherwise."""
-    if not isinstance(table, dict):
-        raise InputError(f"{table!r} is no table")
-    for entry in table:
-        if entry not in known:
-            near = difflib.get_close_matches(entry, known, n=1)
-            hint = f"did you mean {near[0]!r}? Entries" if near else "entries"
-            raise ModelError(f"{file}: unknown entry {entry!r}; {hint} are: {', '.join(known)}")
-    return table
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise InputError(f"{value!r} is no name")
-    return value
-
-
-def _texts(value: object) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise InputError(f"{value!r} is no list of names")
-    return tuple(_text(v) for v in value)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -383,6 +460,121 @@ def _id(
             f"{word}s are: {', '.join(n for n in names if n) or 'none'}"
         )
     return i
+
+
+def compiled(description: RobotDescription) -> mujoco.MjModel:
+    """The described robot alone, as MuJoCo compiles it."""
+    try:
+        return description.spec().compile()
+    except ValueError as error:
+        raise InputError(f"{description.xml.name} does not compile: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class _Link:
+    """What touches: some geoms of one body."""
+
+    body: int
+    geoms: tuple[int, ...]
+    centre: np.ndarray  # (3,) [m] of the ball, or of the geoms, in the body's frame
+    radius: float  # [m] of the ball, 0 for other shapes
+
+
+def _link(model: mujoco.MjModel, point: ContactPoint, about: RobotDescription) -> _Link:
+    if point.ball is not None:
+        geoms = [model.geom(ball_name(point)).id]
+    elif point.geoms:
+        geoms = [_id(model, mujoco.mjtObj.mjOBJ_GEOM, g, "geom", about) for g in point.geoms]
+    body = int(model.geom_bodyid[geoms[0]]) if not point.link else _body(model, point, about)
+    if point.ball is None and not point.geoms:
+        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        welded = [b for b in range(model.nbody) if _rigid(model, b, body)]
+        geoms = np.flatnonzero(collides & np.isin(model.geom_bodyid, welded)).tolist()
+        if not geoms:
+            raise ModelError(
+                f"link {point.link!r} of {about.name} has no geom that collides; give the contact "
+                f"point {point.name!r} a ball = {{pos = [x, y, z], radius = r}}, or geoms"
+            )
+    apart = [g for g in geoms if not _rigid(model, int(model.geom_bodyid[g]), body)]
+    if apart:
+        raise ModelError(
+            f"geom {model.geom(apart[0]).name!r} of {about.name} is not on the link of the contact "
+            f"point {point.name!r}"
+        )
+    kinds = model.geom_type[geoms]
+    unfit = [g for g in geoms if model.geom_type[g] not in CONVEX]
+    if unfit:
+        raise ModelError(f"geom {model.geom(unfit[0]).name!r} of {about.name} cannot touch")
+    places = [_in_body(model, g, body) for g in geoms]
+    centre = np.mean(places, axis=0)
+    round_tip = len(geoms) == 1 and kinds[0] == SPHERE
+    if point.site:
+        site = _id(model, mujoco.mjtObj.mjOBJ_SITE, point.site, "site", about)
+        same = model.site_bodyid[site] == body
+        if round_tip and (not same or np.abs(model.site_pos[site] - centre).max() > CENTRED):
+            raise ModelError(
+                f"site {point.site!r} of {about.name} must be at the centre of its geom "
+                f"{model.geom(geoms[0]).name!r}"
+            )
+    radius = float(model.geom_size[geoms[0], 0]) if round_tip else 0.0
+    return _Link(body, tuple(geoms), centre, radius)
+
+
+def _body(model: mujoco.MjModel, point: ContactPoint, about: RobotDescription) -> int:
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, point.link)
+    if body < 0:
+        names = [model.body(b).name for b in range(1, model.nbody)]
+        raise ModelError(
+            f"contact point {point.name!r} of {about.name}: no link {point.link!r}; "
+            f"{nearest(point.link, names)}"
+        )
+    return body
+
+
+def _rigid(model: mujoco.MjModel, body: int, link: int) -> bool:
+    """True where `body` is the link, or hangs on it without a joint."""
+    while body > link and model.body_jntnum[body] == 0:
+        body = int(model.body_parentid[body])
+    return body == link
+
+
+def _in_body(model: mujoco.MjModel, geom: int, link: int) -> np.ndarray:
+    """A geom's place (3,) [m] in the frame of the link it is rigid with."""
+    p, body = model.geom_pos[geom].copy(), int(model.geom_bodyid[geom])
+    while body != link:
+        turned = np.zeros(3)
+        mujoco.mju_rotVecQuat(turned, p, model.body_quat[body])
+        p, body = model.body_pos[body] + turned, int(model.body_parentid[body])
+    return p
+
+
+def _reach(model: mujoco.MjModel, link: _Link) -> np.ndarray:
+    """(N,) [m/rad] that no point of the link's geoms moves faster than, joint by joint."""
+    bound = np.zeros(model.njnt)
+    places = [np.linalg.norm(_in_body(model, g, link.body)) for g in link.geoms]
+    far = float(np.max(np.array(places) + model.geom_rbound[list(link.geoms)]))
+    body = link.body
+    while body > 0:
+        first = model.body_jntadr[body]
+        for j in range(first, first + model.body_jntnum[body]) if first >= 0 else ():
+            if model.jnt_type[j] == HINGE:
+                bound[j] = far + np.linalg.norm(model.jnt_pos[j])
+            else:
+                bound[j] = 1.0
+        for j in range(first, first + model.body_jntnum[body]) if first >= 0 else ():
+            if model.jnt_type[j] == SLIDE and model.jnt_limited[j]:
+                far += float(np.abs(model.jnt_range[j]).max())
+        far += float(np.linalg.norm(model.body_pos[body]))
+        body = int(model.body_parentid[body])
+    return bound
+
+
+def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
+    """`body` and what carries it, the world last."""
+    above = [body]
+    while above[-1] > 0:
+        above.append(int(model.body_parentid[above[-1]]))
+    return above
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:

@@ -13,8 +13,9 @@ import numpy as np
 
 from hqp_grasp.errors import HqpGraspError, InputError, ResultsError
 from hqp_grasp.grasp import as_array
+from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
-from hqp_grasp.world.robot import Robot, RobotDescription
+from hqp_grasp.world.robot import Robot, compiled
 
 CAN = Cylinder(radius=0.05)  # the paper's first object
 
@@ -23,19 +24,28 @@ CAN = Cylinder(radius=0.05)  # the paper's first object
 class Scene:
     """A robot and an object that stands still, its middle at `position`.
 
+    Without a position it stands in the robot's workspace, and the robot's first hand grasps it.
     `base` moves the robot away from where its model puts it: a hand without an arm is placed so.
     """
 
     robot: str | Path = "wam_bhand"
     object: Cylinder | Prism | Body = CAN
-    position: tuple[float, float, float] = (0.72, 0.0, 0.2)  # [m] world
+    position: tuple[float, float, float] | None = None  # [m] world
     base: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # [m], unit quaternion w x y z
+    hand: str | None = None  # of a robot with several
 
     def __post_init__(self) -> None:
         if not isinstance(self.object, Cylinder | Prism | Body):
             raise InputError(
                 f"unknown object {self.object!r}; choose one of: Cylinder, Prism, Body"
             )
+        description = RobotDescription.load(self.robot, self.hand)
+        object.__setattr__(self, "_description", description)
+        if self.position is None:
+            workspace = description.workspace
+            if workspace is None:
+                workspace = Robot(description, compiled(description)).workspace
+            object.__setattr__(self, "position", workspace)
         try:
             position = as_array("Scene.position", self.position, (3,))
         except InputError as error:
@@ -47,8 +57,6 @@ class Scene:
         if abs(np.linalg.norm(base[3:]) - 1.0) > 1e-9:
             raise InputError(f"Scene.base needs a unit quaternion (w, x, y, z); got {base[3:]}")
         object.__setattr__(self, "base", tuple(base.tolist()))
-        description = RobotDescription.load(self.robot)
-        object.__setattr__(self, "_description", description)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -86,6 +94,7 @@ class Scene:
         given = {f.name: getattr(self.object, f.name) for f in fields(self.object) if f.init}
         thing = {"kind": type(self.object).__name__} | given
         data = {"robot": robot, "object": thing, "position": self.position, "base": self.base}
+        data |= {} if self.hand is None else {"hand": self.hand}
         Path(path).write_text(json.dumps(data, indent=2) + "\n")
 
     @classmethod
@@ -96,13 +105,13 @@ class Scene:
             data = json.loads(Path(path).read_text())
             thing = dict(data["object"])
             thing = kinds[thing.pop("kind")](**thing)
-            return cls(data["robot"], thing, data["position"], data["base"])
+            return cls(data["robot"], thing, data["position"], data["base"], data.get("hand"))
         except (OSError, ValueError, KeyError, TypeError, HqpGraspError) as error:
             raise ResultsError(f"{path} holds no scene: {error}") from error
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.
-        return {name: getattr(self, name) for name in ("robot", "object", "position", "base")}
+        return {name: getattr(self, name) for name in ("robot", "object", "position", "base", "hand")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

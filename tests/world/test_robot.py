@@ -10,7 +10,8 @@ import tiny_hand
 from tiny_hand import TOML, XML, change
 
 from hqp_grasp.errors import InputError, ModelError
-from hqp_grasp.world.robot import Robot, RobotDescription
+from hqp_grasp.world.description import RobotDescription
+from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
 NAMES = ("bhand", "wam_bhand")
@@ -242,7 +243,7 @@ def equality_residual(robot, q):
     ],
 )
 def test_couplings_come_from_joint_and_tendon_equalities(tmp_path, xml, ratio, offset):
-    robot = build(tmp_path, xml)
+    robot = build(tmp_path, change(xml, 'range="-0.1 0.8"', 'range="-9 9"'))
     assert robot.joints == ("lift", "proximal")
     np.testing.assert_allclose(robot.coupling, [[1, 0], [0, 1], [0, ratio]], atol=EXACT)
     np.testing.assert_allclose(robot.offset, [0, 0, offset], atol=EXACT)

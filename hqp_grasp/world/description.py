@@ -1,0 +1,707 @@
+"""What a robot is, as its robot.toml says: model files, hands, and what to change in the files."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib import metadata, resources
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hqp_grasp.errors import InputError, ModelError, number, one_of, positive
+from hqp_grasp.grasp import as_array
+
+SPEED, SLIDE_SPEED = 1.0, 0.25  # [rad/s], [m/s] of joints for which a description gives none
+CLEARANCE = 0.002  # [m] that links keep between them
+MESHES = (".stl", ".obj", ".msh")  # what MuJoCo loads
+CARRIAGE = tuple(f"carriage_{axis}" for axis in ("x", "y", "z", "yaw", "pitch", "roll"))
+CARRIAGE_PITCH = np.radians(40.0)  # of the approach axis below the horizontal, at zero
+CARRIAGE_RANGES = ((-2.0, 2.0),) * 3 + ((-2.6, 2.6), (-1.4, 1.4), (-2.6, 2.6))  # [m], [rad]
+START = ("adduction", "elevation", "offset", "advance", "joints")  # of the drawn first postures
+KEYS = {  # of each table; a key that is none of these is refused
+    "file": (
+        *("file", "prefix", "at", "pos", "quat", "rpy"),
+        *("degrees", "balanceinertia", "fusestatic", "package_root"),
+    ),
+    "hand": ("name", "palm", "arm", "adduction", "contact_points"),
+    "palm": ("body", "pos", "approach", "opposition"),
+    "contact point": (
+        *("name", "link", "geom", "geoms", "ball", "site", "flexion"),
+        *("force", "torque"),
+    ),
+    "ball": ("pos", "radius"),
+    "coupling": ("joint", "to", "ratio", "offset"),
+    "start": START,
+}
+TOP = (
+    *("model", "description", "home", "speed", "velocity", "lock", "couplings", "drop_couplings"),
+    *("ranges", "carriage", "workspace", "clearance", "start", "hands"),
+    *KEYS["hand"][1:],
+)
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """One MJCF or URDF of a robot, and where it is joined to those before it."""
+
+    file: Path
+    prefix: str = ""  # before all its names
+    at: str = ""  # body that carries it, "" the world
+    pos: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m] in that body's frame
+    quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)  # w x y z
+    degrees: bool | None = None  # what the file's angles are in; None: as it says itself
+    balanceinertia: bool | None = None  # None: only for a URDF
+    fusestatic: bool | None = None  # None: never for a URDF, whose fixed links would melt away
+    package_root: Path | None = None  # folder that package:// stands for; None: looked for
+
+    @property
+    def is_urdf(self) -> bool:
+        return self.file.suffix.lower() == ".urdf"
+
+    @property
+    def stands_alone(self) -> bool:
+        """Neither placed nor renamed."""
+        plain = ModelFile(self.file)
+        return all(getattr(self, n) == getattr(plain, n) for n in ("prefix", "at", "pos", "quat"))
+
+    def spec(self) -> mujoco.MjSpec:
+        """The file alone, as MuJoCo reads it."""
+        try:
+            if self.is_urdf:
+                spec = mujoco.MjSpec.from_string(self._urdf())
+                spec.compiler.balanceinertia = self.balanceinertia is not False
+                spec.compiler.fusestatic = self.fusestatic is True
+            else:
+                spec = mujoco.MjSpec.from_file(str(self.file))
+                if self.balanceinertia is not None:
+                    spec.compiler.balanceinertia = self.balanceinertia
+                if self.fusestatic is not None:
+                    spec.compiler.fusestatic = self.fusestatic
+        except (ValueError, ET.ParseError) as error:
+            kind = "URDF" if self.is_urdf else "MJCF"
+            raise ModelError(f"{self.file} is not a valid {kind}: {error}") from error
+        if self.degrees is not None:
+            spec.compiler.degree = self.degrees
+        elif not self.is_urdf and spec.compiler.degree:
+            self._refuse_radians(spec)
+        # MuJoCo fills a keyframe that is too short with zeros, without a word.
+        for key in spec.keys:
+            if 0 < len(key.qpos) < len(spec.joints):
+                raise ModelError(
+                    f"keyframe {key.name!r} of {self.file.name} has {len(key.qpos)} angles; "
+                    f"the model has {len(spec.joints)} joints"
+                )
+        return spec
+
+    def _refuse_radians(self, spec: mujoco.MjSpec) -> None:
+        """Raise where a file that does not name its unit lists radians: MuJoCo takes degrees."""
+        hinges = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
+        ends = [abs(end) for joint in hinges for end in joint.range]
+        if ends and 0.0 < max(ends) < 2.0 * np.pi:
+            joint = max(hinges, key=lambda j: max(abs(j.range)))
+            raise ModelError(
+                f"{self.file.name} does not say what its angles are in, and MuJoCo then reads "
+                f"degrees: joint {joint.name!r} would turn within {joint.range.tolist()} degrees, "
+                "hundredths of a radian; say degrees = false (or true, if it is right)"
+            )
+
+    def _urdf(self) -> str:
+        """The URDF without what is only for the eye, its meshes by their absolute paths."""
+        if not self.file.is_file():
+            raise ModelError(f"{self.file} is not a valid URDF: there is no such file")
+        root = ET.parse(self.file).getroot()
+        for link in root.iter("link"):
+            for visual in link.findall("visual"):
+                link.remove(visual)
+            for mesh in link.iter("mesh"):
+                path = self._mesh(mesh.get("filename", ""), link.get("name", ""))
+                mesh.set("filename", str(path))
+        compiler = '<mujoco><compiler strippath="false"/></mujoco>'
+        root.insert(0, ET.fromstring(compiler))
+        return ET.tostring(root, encoding="unicode")
+
+    def _mesh(self, name: str, link: str) -> Path:
+        """The file of a collision mesh; package:// begins at the root, or in a folder above."""
+        here = self.file.parent
+        if name.startswith("package://"):
+            inside = name.removeprefix("package://")
+            roots = [self.package_root] if self.package_root else list(here.resolve().parents)
+            # A package's folder often is not named as the package.
+            shorter = inside.partition("/")[2]
+            places = [r / part for part in (inside, shorter) for r in roots]
+        else:
+            places = [here / name.removeprefix("file://")]
+        found = next((path for path in places if path.is_file()), None)
+        if found is None:
+            raise ModelError(
+                f"{self.file.name}: link {link!r} has the mesh {name!r}, which is at none of "
+                f"{', '.join(map(str, places[:3]))}; say where package:// begins: "
+                'package_root = "FOLDER"'
+            )
+        if found.suffix.lower() not in MESHES:
+            raise ModelError(
+                f"{self.file.name}: the collision mesh of link {link!r} is {found.name}, which "
+                f"MuJoCo cannot load; convert it to one of {', '.join(MESHES)}, or take a URDF "
+                "with simpler collision shapes"
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class Palm:
+    """A palm: a site of the model, or a place on a body with two axes."""
+
+    site: str = ""  # z is the approach axis, x the opposition axis
+    body: str = ""
+    pos: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m] in the body's frame
+    approach: tuple[float, ...] = (0.0, 0.0, 1.0)  # out of the palm, in the body's frame
+    opposition: tuple[float, ...] = (1.0, 0.0, 0.0)  # along which fingers oppose one another
+
+
+@dataclass(frozen=True)
+class ContactPoint:
+    """A place on the robot that may touch: the geoms of one link, or some of them."""
+
+    name: str
+    link: str = ""  # body; its geoms that collide touch, and those of bodies welded to it
+    geoms: tuple[str, ...] = ()  # only these of them
+    site: str = ""  # at the centre of the one geom, a sphere
+    ball: tuple[float, ...] | None = None  # (4,) [m] centre in the link's frame, and radius
+    closing: Mapping[str, float] | None = None  # signed weight of each joint that closes it
+    force: str = ""  # sensors
+    torque: str = ""
+
+    @property
+    def flexion(self) -> tuple[str, ...]:
+        """The joints that press it."""
+        return tuple(self.closing or ())
+
+
+@dataclass(frozen=True)
+class Hand:
+    """What grasps: contact points that oppose one another, on a palm that an arm carries."""
+
+    name: str
+    contact_points: tuple[ContactPoint, ...]
+    palm: Palm | None = None
+    arm: tuple[str, ...] | None = None  # joints that carry the palm
+    adduction: str | None = None  # joint that spreads the fingers
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """joint = ratio · to + offset."""
+
+    joint: str
+    to: str
+    ratio: float = 1.0
+    offset: float = 0.0  # [rad]
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """What a robot.toml says, defaults filled in (see docs/any-robot.md)."""
+
+    name: str
+    files: tuple[ModelFile, ...]
+    hands: tuple[Hand, ...]
+    hand_name: str = ""  # the one that grasps; "": the first
+    home: str | Mapping[str, float] = field(default_factory=dict)  # keyframe, or joint: angle
+    speed: float | None = None  # [rad/s] of joints that `velocity` leaves out
+    velocity: Mapping[str, float] = field(default_factory=dict)  # [rad/s]
+    lock: tuple[str, ...] = ()  # joints that stay at home
+    couplings: tuple[Coupling, ...] = ()
+    drop_couplings: bool | tuple[str, ...] = ()  # names of equalities or of joints; True: all
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # [rad]
+    carriage: bool = False  # six joints that carry all
+    workspace: tuple[float, ...] | None = None  # (3,) [m] where an object stands
+    clearance: float = CLEARANCE  # [m] that links keep between them; 0: they need not
+    start: Mapping[str, Any] = field(default_factory=dict)  # ranges of a Start
+
+    @classmethod
+    def load(cls, robot: str | Path, hand: str | None = None) -> RobotDescription:
+        """Read a robot of this package by name; any folder with a robot.toml, or file, by path."""
+        path = _find(robot)
+        try:
+            data = tomllib.loads(path.read_text(encoding="utf-8"))
+        except tomllib.TOMLDecodeError as error:
+            raise ModelError(f"{path} is not valid TOML: {error}") from error
+        try:
+            about = _description(path, data)
+        except KeyError as error:
+            raise ModelError(f"{path} lacks the entry {error}") from error
+        except (TypeError, AttributeError, InputError) as error:
+            raise ModelError(f"{path}: an entry is of the wrong kind: {error}") from error
+        if hand is not None:
+            one_of(f"hand of {about.name}", hand, [h.name for h in about.hands])
+            about = replace(about, hand_name=hand)
+        return about
+
+    @property
+    def hand(self) -> Hand:
+        """The hand that grasps."""
+        return next((h for h in self.hands if h.name == self.hand_name), self.hands[0])
+
+    @property
+    def xml(self) -> Path:
+        """The first model file."""
+        return self.files[0].file
+
+    @property
+    def contact_points(self) -> tuple[ContactPoint, ...]:
+        return self.hand.contact_points
+
+    @property
+    def arm(self) -> tuple[str, ...]:
+        return self.hand.arm or ()
+
+    @property
+    def adduction(self) -> str | None:
+        return self.hand.adduction
+
+    @property
+    def palm(self) -> str:
+        """Site of the hand's palm in `spec()`."""
+        palm = self.hand.palm
+        return palm.site if palm is not None and palm.site else f"palm of {self.hand.name}"
+
+    def spec(self) -> mujoco.MjSpec:
+        """The described model, ready to be composed with others."""
+        if len(self.files) == 1 and not self.carriage and self.files[0].stands_alone:
+            spec = self.files[0].spec()
+        else:
+            spec = self._joined()
+        self._change(spec)
+        return spec
+
+    def _joined(self) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec()
+        spec.modelname = self.name
+        spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
+        root = spec.worldbody
+        if self.carriage:
+            root = self._carriage(spec)
+        for part in self.files:
+            child = part.spec()
+            child.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
+            for key in list(child.keys):  # each would leave the other parts' joints at 0
+                child.delete(key)
+            body: Any = root
+            if part.at:
+                body = spec.body(part.at)
+                if body is None:
+                    names = ", ".join(b.name for b in spec.bodies if b.name)
+                    raise ModelError(
+                        f"{part.file.name} is to be joined at {part.at!r}, which the files before "
+                        f"it do not have; their bodies are: {names}"
+                    )
+            try:
+                spec.attach(
+                    child,
+                    prefix=part.prefix,
+                    frame=_frame(spec, body, part),
+                )
+            except ValueError as error:
+                raise ModelError(
+                    f"{part.file.name} cannot be joined: {error}; where names repeat, give it a "
+                    'prefix = "hand_"'
+                ) from error
+        return spec
+
+    def _carriage(self, spec: mujoco.MjSpec) -> mujoco.MjsFrame:
+        """Six joints that carry the robot, at zero with its palm as a drawn start has it."""
+        palm = self.hand.palm
+        if palm is None:
+            raise ModelError(
+                f"{self.name}: a carriage needs a palm = {{body = ..., approach = ..., opposition "
+                "= ...} to know how it is to hold the hand"
+            )
+        alone = replace(self, carriage=False).spec()
+        home = self.home_angles(alone)
+        model = alone.compile()
+        data = mujoco.MjData(model)
+        for joint, angle in home.items():
+            if joint not in CARRIAGE:
+                data.joint(joint).qpos[0] = angle
+        mujoco.mj_kinematics(model, data)
+        R_world_palm = data.site(self.palm).xmat.reshape(3, 3)
+        z = np.array([np.cos(CARRIAGE_PITCH), 0.0, -np.sin(CARRIAGE_PITCH)])
+        turn = np.column_stack([[0.0, 1.0, 0.0], np.cross(z, [0.0, 1.0, 0.0]), z]) @ R_world_palm.T
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, turn.ravel())
+        body = spec.worldbody.add_body(name="carriage", mass=1.0, inertia=[0.01, 0.01, 0.01])
+        body.explicitinertial = True
+        for joint, axis, ends in zip(
+            CARRIAGE, np.eye(3)[[0, 1, 2, 2, 1, 0]], CARRIAGE_RANGES, strict=True
+        ):
+            slides = joint[-2:] in ("_x", "_y", "_z")
+            kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+            body.add_joint(
+                name=joint,
+                type=kind,
+                axis=axis,
+                range=ends,
+                limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            )
+        # The hinges turn the hand about its palm.
+        return body.add_frame(pos=-turn @ data.site(self.palm).xpos, quat=quat)
+
+    def _change(self, spec: mujoco.MjSpec) -> None:
+        """Do to the model what the description asks for."""
+        joints = {joint.name: joint for joint in spec.joints}
+        for name, ends in self.ranges.items():
+            joint = joints[self._joint(name, joints, "ranges")]
+            joint.range, joint.limited = ends, mujoco.mjtLimited.mjLIMITED_TRUE
+        for name in self.drop_couplings if isinstance(self.drop_couplings, tuple) else ():
+            known = [n for e in spec.equalities for n in (e.name, e.name1) if n]
+            if name not in known:
+                raise ModelError(
+                    f"drop_couplings of {self.name} names {name!r}; the couplings are: "
+                    f"{', '.join(known) or 'none'}"
+                )
+        for equality in list(spec.equalities):
+            drop = self.drop_couplings
+            if drop is True or (drop and {equality.name, equality.name1} & set(drop)):  # type: ignore[arg-type]
+                spec.delete(equality)
+        for coupling in self.couplings:
+            one = joints[self._joint(coupling.joint, joints, "couplings")]
+            other = joints[self._joint(coupling.to, joints, "couplings")]
+            rest = coupling.offset + coupling.ratio * other.ref - one.ref
+            _couple(spec, one.name, other.name, rest, coupling.ratio)
+        home = self.home_angles(spec)
+        for name in (*self.lock, *home):
+            self._joint(name, joints, "lock" if name in self.lock else "home")
+        for name in self.lock:
+            if joints[name].type == mujoco.mjtJoint.mjJNT_FREE:
+                spec.delete(joints[name])
+                continue
+            ref = joints[name].ref
+            _couple(spec, name, "", home.get(name, ref) - ref, 0.0)
+        for body in spec.bodies:
+            for i, geom in enumerate(body.geoms):
+                if not geom.name and (geom.contype or geom.conaffinity):
+                    geom.name = f"{body.name}:{i}"
+        bodies = {body.name: body for body in spec.bodies}
+        for hand in self.hands:
+            palm = hand.palm
+            if palm is not None and palm.body:
+                _known("body", palm.body, bodies, f"palm of {self.name}")
+                x, z = _axes(palm)
+                quat = np.zeros(4)
+                mujoco.mju_mat2Quat(quat, np.column_stack([x, np.cross(z, x), z]).ravel())
+                bodies[palm.body].add_site(name=f"palm of {hand.name}", pos=palm.pos, quat=quat)
+            for point in hand.contact_points:
+                if point.ball is not None:
+                    _known("body", point.link, bodies, f"contact point {point.name} of {self.name}")
+                    bodies[point.link].add_geom(
+                        name=ball_name(point),
+                        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                        pos=point.ball[:3],
+                        size=[point.ball[3], 0.0, 0.0],
+                        mass=0.0,
+                    )
+
+    def home_angles(self, spec: mujoco.MjSpec) -> Mapping[str, float]:
+        """Angle of each joint at home that the description gives, or its keyframe [rad]."""
+        if not isinstance(self.home, str):
+            return self.home
+        key = next((key for key in spec.keys if key.name == self.home), None)
+        if key is None:
+            names = ", ".join(k.name for k in spec.keys if k.name)
+            raise ModelError(
+                f"no keyframe {self.home!r} in {self.xml.name} of {self.name}; "
+                f"keyframes are: {names or 'none'}"
+            )
+        return dict(zip((j.name for j in spec.joints), key.qpos, strict=False))
+
+    def _joint(self, name: str, joints: Mapping[str, object], where: str) -> str:
+        return _known("joint", name, joints, f"{where} of {self.name}")
+
+
+def ball_name(point: ContactPoint) -> str:
+    """The geom that stands for a contact point with a ball."""
+    return f"ball of {point.name}"
+
+
+def _frame(spec: mujoco.MjSpec, carrier: Any, part: ModelFile) -> mujoco.MjsFrame:
+    """Where a file is joined to a body, or to a frame of the carriage."""
+    if isinstance(carrier, mujoco.MjsFrame):
+        body = spec.body("carriage")
+        p, q = np.zeros(3), np.zeros(4)
+        mujoco.mju_mulPose(p, q, carrier.pos, carrier.quat, np.array(part.pos), np.array(part.quat))
+        return body.add_frame(pos=p, quat=q)
+    return carrier.add_frame(pos=part.pos, quat=part.quat)
+
+
+def _find(robot: str | Path) -> Path:
+    """The robot.toml of a robot by name, folder or file."""
+    if isinstance(robot, Path) or "/" in str(robot) or str(robot).endswith(".toml"):
+        path = Path(robot)
+        if path.suffix == ".toml":
+            if not path.is_file():
+                raise ModelError(f"there is no file {path}")
+            return path
+        if not (path / "robot.toml").is_file():
+            raise ModelError(f"{path} is no robot folder: it has no robot.toml")
+        return path / "robot.toml"
+    root = Path(str(resources.files("hqp_grasp.robots")))
+    known = sorted(p.parent.name for p in root.glob("*/*.toml"))
+    return root / one_of("robot", robot, known) / "robot.toml"
+
+
+def locate(text: str, folder: Path) -> Path:
+    """A file by its path, or as `package:path` in an installed package, which is not imported.
+
+    The path begins in the package's own folder, or is how the path of one of the installed files
+    ends.
+    """
+    package, colon, inside = text.partition(":")
+    if not colon or "/" in package:
+        return folder / text
+    spec = find_spec(package) if package.isidentifier() else None
+    for place in (spec.submodule_search_locations or ()) if spec is not None else ():
+        if (Path(place) / inside).exists():
+            return Path(place) / inside
+    try:
+        installed = metadata.files(package) or []
+    except metadata.PackageNotFoundError:
+        installed = []
+        if spec is None:
+            raise ModelError(
+                f"{text}: the package {package!r} is not installed; pip install --no-deps "
+                f"{package} is enough"
+            ) from None
+    found = sorted({str(f.locate()) for f in installed if f"/{f}".endswith(f"/{inside}")})
+    if len(found) != 1:
+        what = f"{len(found)} files end so: {', '.join(found[:3])}" if found else "no such file"
+        raise ModelError(f"{text}: {what} in the installed package {package!r}")
+    return Path(found[0])
+
+
+def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
+    _check(data, TOP, path.name)
+    folder = path.parent
+    model = data["model"]
+    parts = model if isinstance(model, list) else [model]
+    if "hands" in data:
+        mixed = [key for key in KEYS["hand"] if key in data]
+        if mixed:
+            raise InputError(f"{mixed[0]} belongs into [[hands]], as there are hands")
+        hands = tuple(_hand(h) for h in data["hands"])
+    else:
+        hands = (_hand({"name": "hand", **{k: data[k] for k in KEYS["hand"] if k in data}}),)
+    if not hands:
+        raise InputError("hands is empty")
+    home = data.get("home", {})
+    drop = data.get("drop_couplings", [])
+    workspace = data.get("workspace")
+    return RobotDescription(
+        name=folder.resolve().name if path.name == "robot.toml" else path.stem,
+        files=tuple(_file(part, folder) for part in parts),
+        hands=hands,
+        home=home if isinstance(home, str) else _numbers("home", home),
+        speed=positive("speed", data["speed"]) if "speed" in data else None,
+        velocity={j: positive(f"velocity of {j}", v) for j, v in data.get("velocity", {}).items()},
+        lock=_texts(data.get("lock", [])),
+        couplings=tuple(_coupling(c) for c in data.get("couplings", [])),
+        drop_couplings=drop if isinstance(drop, bool) else _texts(drop),
+        ranges={j: _range(f"ranges of {j}", v) for j, v in data.get("ranges", {}).items()},
+        carriage=_flag("carriage", data.get("carriage", False)),
+        workspace=None if workspace is None else _vector("workspace", workspace),
+        clearance=number("clearance", data.get("clearance", CLEARANCE)),
+        start=_start(data.get("start", {})),
+    )
+
+
+def _file(part: object, folder: Path) -> ModelFile:
+    if isinstance(part, str):
+        return ModelFile(locate(part, folder))
+    if not isinstance(part, dict):
+        raise InputError(f"model must be a file, or tables that say more; got {part!r}")
+    _check(part, KEYS["file"], "model")
+    quat = np.array([1.0, 0.0, 0.0, 0.0])
+    if "quat" in part:
+        quat = np.array(as_array("quat", part["quat"], (4,)))
+        positive("length of quat", np.linalg.norm(quat))
+        quat = quat / np.linalg.norm(quat)
+    elif "rpy" in part:
+        mujoco.mju_euler2Quat(quat, as_array("rpy", part["rpy"], (3,)), "XYZ")
+    flags = ("degrees", "balanceinertia", "fusestatic")
+    return ModelFile(
+        locate(_text(part["file"]), folder),
+        _text(part.get("prefix", "")),
+        _text(part.get("at", "")),
+        _vector("pos", part.get("pos", [0.0] * 3)),
+        tuple(quat.tolist()),
+        **{flag: _flag(flag, part[flag]) for flag in flags if flag in part},
+        package_root=folder / _text(part["package_root"]) if "package_root" in part else None,
+    )
+
+
+def _hand(data: object) -> Hand:
+    if not isinstance(data, dict):
+        raise InputError(f"hands must be tables; got {data!r}")
+    _check(data, KEYS["hand"], "hands")
+    points = tuple(_contact_point(p) for p in data["contact_points"])
+    if not points:
+        raise InputError("contact_points is empty")
+    names = [point.name for point in points]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"two contact points are named {twice!r}")
+    return Hand(
+        _text(data["name"]),
+        points,
+        _palm(data["palm"]) if "palm" in data else None,
+        _texts(data["arm"]) if "arm" in data else None,
+        _text(data["adduction"]) if "adduction" in data else None,
+    )
+
+
+def _palm(data: object) -> Palm:
+    if not isinstance(data, dict):
+        return Palm(_text(data))
+    _check(data, KEYS["palm"], "palm")
+    vectors = ("pos", "approach", "opposition")
+    palm = Palm(
+        body=_text(data["body"]),
+        **{key: _vector(f"palm.{key}", data[key]) for key in vectors if key in data},
+    )
+    _axes(palm)
+    return palm
+
+
+def _axes(palm: Palm) -> tuple[np.ndarray, np.ndarray]:
+    """Opposition axis x and approach axis z, unit and orthogonal; x gives way."""
+    z, x = np.array(palm.approach), np.array(palm.opposition)
+    z = z / positive("length of palm.approach", np.linalg.norm(z))
+    x = x - (x @ z) * z
+    if np.linalg.norm(x) < 1e-6:
+        raise InputError("palm.opposition is along palm.approach")
+    return x / np.linalg.norm(x), z
+
+
+def _contact_point(data: object) -> ContactPoint:
+    if not isinstance(data, dict):
+        raise InputError(f"contact_points must be links, or tables; got {data!r}")
+    _check(data, KEYS["contact point"], "contact_points")
+    ball = data.get("ball")
+    if ball is not None:
+        _check(ball, KEYS["ball"], "ball")
+        centre = _vector("ball.pos", ball.get("pos", [0.0] * 3))
+        ball = (*centre, positive("ball.radius", ball["radius"]))
+    flexion = data.get("flexion")
+    if isinstance(flexion, dict):
+        closing: Mapping[str, float] | None = _numbers("flexion", flexion)
+    else:
+        closing = None if flexion is None else dict.fromkeys(_texts(flexion), 1.0)
+    geoms = (_text(data["geom"]),) if "geom" in data else _texts(data.get("geoms", []))
+    link = _text(data.get("link", ""))
+    if not link and not geoms:
+        raise KeyError("link")
+    return ContactPoint(
+        _text(data.get("name", link or geoms[0])),
+        link,
+        geoms,
+        _text(data.get("site", "")),
+        ball,
+        closing,
+        _text(data.get("force", "")),
+        _text(data.get("torque", "")),
+    )
+
+
+def _coupling(data: object) -> Coupling:
+    if not isinstance(data, dict):
+        raise InputError(f"couplings must be tables; got {data!r}")
+    _check(data, KEYS["coupling"], "couplings")
+    ratio, offset = (
+        number(f"couplings.{k}", data.get(k, default))
+        for k, default in (("ratio", 1.0), ("offset", 0.0))
+    )
+    return Coupling(_text(data["joint"]), _text(data["to"]), ratio, offset)
+
+
+def _start(data: object) -> Mapping[str, Any]:
+    """Fields of a Start: angles in degrees here, radians there."""
+    if not isinstance(data, dict):
+        raise InputError(f"start must be a table; got {data!r}")
+    _check(data, KEYS["start"], "start")
+    start: dict[str, Any] = {}
+    for key, value in data.items():
+        if key in ("advance", "joints"):
+            start[key] = number(f"start.{key}", value)
+        else:
+            low, high = _range(f"start.{key}", value)
+            turn = 1.0 if key == "offset" else np.pi / 180.0
+            start[key] = (low * turn, high * turn)
+    return start
+
+
+def _couple(spec: mujoco.MjSpec, joint: str, to: str, rest: float, ratio: float) -> None:
+    equality = spec.add_equality(name1=joint, name2=to, type=mujoco.mjtEq.mjEQ_JOINT)
+    equality.data[:5] = [rest, ratio, 0.0, 0.0, 0.0]
+
+
+def nearest(name: str, known: object) -> str:
+    """The hint that names the nearest valid name, or all of them."""
+    names = [n for n in map(str, known) if n]  # type: ignore[call-overload]
+    near = difflib.get_close_matches(name, names, 1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"{hint}they are: {', '.join(names) or 'none'}"
+
+
+def _known(kind: str, name: str, known: object, where: str) -> str:
+    if name not in known:  # type: ignore[operator]
+        raise ModelError(f"{where}: no {kind} {name!r}; {nearest(name, known)}")
+    return name
+
+
+def _check(data: object, valid: tuple[str, ...], where: str) -> None:
+    if not isinstance(data, Mapping):
+        raise InputError(f"{where} must be a table; got {data!r}")
+    for key in data:
+        if key not in valid:
+            near = difflib.get_close_matches(key, valid, 1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise ModelError(f"{where}: unknown key {key!r}; {hint}keys are: {', '.join(valid)}")
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"{value!r} is no name")
+    return value
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise InputError(f"{value!r} is no list of names")
+    return tuple(_text(v) for v in value)
+
+
+def _flag(name: str, value: object) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(f"{name} must be true or false; got {value!r}")
+    return value
+
+
+def _vector(name: str, value: object) -> tuple[float, ...]:
+    return tuple(as_array(name, value, (3,)).tolist())
+
+
+def _range(name: str, value: object) -> tuple[float, float]:
+    low, high = as_array(name, value, (2,)).tolist()
+    if not low <= high:
+        raise InputError(f"{name} must be [low, high]; got {value!r}")
+    return low, high
+
+
+def _numbers(name: str, value: Mapping[str, object]) -> dict[str, float]:
+    return {key: number(f"{name} of {key}", v) for key, v in value.items()}
