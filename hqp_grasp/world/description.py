@@ -274,84 +274,77 @@ class RobotDescription:
 
     def spec(self) -> mujoco.MjSpec:
         """The described model, ready to be composed with others."""
-        if len(self.files) == 1 and not self.carriage and self.files[0].stands_alone:
-            spec = self.files[0].spec()
-        else:
-            spec = self._joined()
+        spec = self._joined()
+        if self.carriage:
+            self._put_on_carriage(spec)
         self._change(spec)
         return spec
 
     def _joined(self) -> mujoco.MjSpec:
-        spec = mujoco.MjSpec()
-        spec.modelname = self.name
+        """The files as one model."""
+        spec = self.files[0].spec()
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
-        root = spec.worldbody
-        if self.carriage:
-            root = self._carriage(spec)
-        for part in self.files:
+        if not self.files[0].stands_alone:
+            raise ModelError(
+                f"{self.files[0].file.name} is the first file of {self.name}: pos, quat and prefix "
+                "are for those that are joined to it"
+            )
+        if len(self.files) > 1:  # its keyframes would leave the other parts' joints at 0
+            for key in list(spec.keys):
+                spec.delete(key)
+        for part in self.files[1:]:
+            if not part.prefix:
+                raise ModelError(
+                    f"{part.file.name} is joined to other files and needs a prefix before its "
+                    'names, such as prefix = "hand_"'
+                )
             child = part.spec()
             child.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
-            for key in list(child.keys):  # each would leave the other parts' joints at 0
+            for key in list(child.keys):
                 child.delete(key)
-            body: Any = root
-            if part.at:
-                body = spec.body(part.at)
-                if body is None:
-                    names = ", ".join(b.name for b in spec.bodies if b.name)
-                    raise ModelError(
-                        f"{part.file.name} is to be joined at {part.at!r}, which the files before "
-                        f"it do not have; their bodies are: {names}"
-                    )
+            body = spec.body(part.at) if part.at else spec.worldbody
+            if body is None:
+                _known("body", part.at, [b.name for b in spec.bodies], f"at of {part.file.name}")
+            frame = body.add_frame(pos=part.pos, quat=part.quat)
             try:
-                spec.attach(
-                    child,
-                    prefix=part.prefix,
-                    frame=_frame(spec, body, part),
-                )
+                spec.attach(child, prefix=part.prefix, frame=frame)
             except ValueError as error:
-                raise ModelError(
-                    f"{part.file.name} cannot be joined: {error}; where names repeat, give it a "
-                    'prefix = "hand_"'
-                ) from error
+                raise ModelError(f"{part.file.name} cannot be joined: {error}") from error
         return spec
 
-    def _carriage(self, spec: mujoco.MjSpec) -> mujoco.MjsFrame:
-        """Six joints that carry the robot, at zero with its palm as a drawn start has it."""
-        palm = self.hand.palm
+    def _put_on_carriage(self, spec: mujoco.MjSpec) -> None:
+        """Six joints at the root: at zero the palm is held as a drawn start holds it."""
+        palm, roots = self.hand.palm, spec.worldbody.bodies
         if palm is None:
             raise ModelError(
                 f"{self.name}: a carriage needs a palm = {{body = ..., approach = ..., opposition "
                 "= ...} to know how it is to hold the hand"
             )
+        if len(roots) != 1 or roots[0].joints or spec.worldbody.geoms:
+            raise ModelError(f"{self.name}: a carriage carries one root body without joints")
         alone = replace(self, carriage=False).spec()
-        home = self.home_angles(alone)
         model = alone.compile()
         data = mujoco.MjData(model)
-        for joint, angle in home.items():
+        for joint, angle in self.home_angles(alone).items():
             if joint not in CARRIAGE:
                 data.joint(joint).qpos[0] = angle
         mujoco.mj_kinematics(model, data)
-        R_world_palm = data.site(self.palm).xmat.reshape(3, 3)
         z = np.array([np.cos(CARRIAGE_PITCH), 0.0, -np.sin(CARRIAGE_PITCH)])
-        turn = np.column_stack([[0.0, 1.0, 0.0], np.cross(z, [0.0, 1.0, 0.0]), z]) @ R_world_palm.T
+        y = np.array([0.0, 1.0, 0.0])
+        R_palm = data.site(self.palm).xmat.reshape(3, 3)
+        turn = np.column_stack([y, np.cross(z, y), z]) @ R_palm.T
+        root = model.body(roots[0].name).id
+        R_root = turn @ data.xmat[root].reshape(3, 3)
         quat = np.zeros(4)
-        mujoco.mju_mat2Quat(quat, turn.ravel())
-        body = spec.worldbody.add_body(name="carriage", mass=1.0, inertia=[0.01, 0.01, 0.01])
-        body.explicitinertial = True
-        for joint, axis, ends in zip(
-            CARRIAGE, np.eye(3)[[0, 1, 2, 2, 1, 0]], CARRIAGE_RANGES, strict=True
-        ):
-            slides = joint[-2:] in ("_x", "_y", "_z")
-            kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
-            body.add_joint(
-                name=joint,
-                type=kind,
-                axis=axis,
-                range=ends,
-                limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            )
-        # The hinges turn the hand about its palm.
-        return body.add_frame(pos=-turn @ data.site(self.palm).xpos, quat=quat)
+        mujoco.mju_mat2Quat(quat, R_root.ravel())
+        to_palm = turn @ (data.site(self.palm).xpos - data.xpos[root])
+        roots[0].pos, roots[0].quat = -to_palm, quat
+        axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
+        for name, axis, ends in zip(CARRIAGE, axes, CARRIAGE_RANGES, strict=True):
+            slides = name[-2:] in ("_x", "_y", "_z")
+            joint = roots[0].add_joint(name=name, axis=R_root.T @ axis, pos=R_root.T @ to_palm)
+            joint.type = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+            joint.range, joint.limited = ends, mujoco.mjtLimited.mjLIMITED_TRUE
 
     def _change(self, spec: mujoco.MjSpec) -> None:
         """Do to the model what the description asks for."""
@@ -428,16 +421,6 @@ class RobotDescription:
 def ball_name(point: ContactPoint) -> str:
     """The geom that stands for a contact point with a ball."""
     return f"ball of {point.name}"
-
-
-def _frame(spec: mujoco.MjSpec, carrier: Any, part: ModelFile) -> mujoco.MjsFrame:
-    """Where a file is joined to a body, or to a frame of the carriage."""
-    if isinstance(carrier, mujoco.MjsFrame):
-        body = spec.body("carriage")
-        p, q = np.zeros(3), np.zeros(4)
-        mujoco.mju_mulPose(p, q, carrier.pos, carrier.quat, np.array(part.pos), np.array(part.quat))
-        return body.add_frame(pos=p, quat=q)
-    return carrier.add_frame(pos=part.pos, quat=part.quat)
 
 
 def _find(robot: str | Path) -> Path:

@@ -362,11 +362,14 @@ class Robot:
         return J @ self.coupling
 
     def opened(self, q: np.ndarray) -> np.ndarray:
-        """q (n,) with every finger open as far as its joints' ranges let it."""
+        """q (n,) with every finger open, until the first of its joints is at its range's end."""
         q = q.copy()
         for w in self.closing:
-            end = np.where(w > 0.0, self.q_lower, self.q_upper)
-            q = np.where((w != 0.0) & np.isfinite(end), end, q)
+            moving = w != 0.0
+            room = np.where(w > 0.0, q - self.q_lower, self.q_upper - q)[moving]
+            s = float((room / np.abs(w[moving])).min())
+            if np.isfinite(s):
+                q[moving] = np.clip(q - s * w, self.q_lower, self.q_upper)[moving]
         return q
 
     def grasp(
@@ -400,6 +403,7 @@ class Robot:
                     body=self.model.body(int(self._bodies[i])).name,
                     point=places[i],
                     flexion=self.flexion[i],
+                    closing=tuple(self.closing[i, list(self.flexion[i])].tolist()),
                     tip_radius=radius,
                 )
             )
