@@ -127,7 +127,7 @@ def placed(scene: Scene, frames: Sequence[Frame]) -> Scene:
     round tips were on their contacts: base and contacts are matched by least squares.
     """
     robot = scene.articulated
-    if robot.description.arm:
+    if robot.arm:
         return scene
     frame = next(frame for frame in frames if frame.touched)
     tips = robot.centers(frame.q)

@@ -203,8 +203,8 @@ def _reach(robot: Robot, q: np.ndarray) -> float:
     p_palm, R_palm = robot.palm(q)
     farthest = np.full(len(robot.flexion), -np.inf)
     for share in np.linspace(0.0, 1.0, CLOSINGS):
-        q = robot.opened(q, share)
-        ahead = (robot.centers(q) - p_palm) @ R_palm[:, 2] + robot.tip_radius
+        closed = robot.opened(q, share)
+        ahead = (robot.centers(closed) - p_palm) @ R_palm[:, 2] + robot.tip_radius
         farthest = np.maximum(farthest, ahead)
     return float(farthest.min())
 

@@ -144,6 +144,7 @@ def _flexion_columns(grasp: Grasp) -> np.ndarray:
 def _closing_weights(grasp: Grasp, gamma: np.ndarray) -> np.ndarray | None:
     """Weight of each column of γ (k, g) where all fingers close along one direction, else None."""
     import os
+
     if gamma.shape[1] == 1 or not all(c.closing for c in grasp.contacts) or os.environ.get("ALLJ"):
         return None
     weights = np.zeros(gamma.shape)

@@ -265,7 +265,8 @@ class GeometricProbe:
         the tilt is the nearest point's place.
         """
         import os
-        TILT=float(os.environ.get("TILT","0.3"))
+
+        TILT = float(os.environ.get("TILT", "0.3"))
         model, data = self.scene.model, self._data
         geoms = list(self.scene.articulated.geoms[i])
         pose = data.geom_xpos[geoms].copy(), data.geom_xmat[geoms].copy()
@@ -284,7 +285,7 @@ class GeometricProbe:
             rho.append(max(0.0, (2.0 * (near.gap + CLEAR) - gaps[0] - gaps[1]) / TILT**2))
             middle += (gaps[0] - gaps[1]) / (2.0 * np.sin(TILT)) * tangent
         data.geom_xpos[geoms], data.geom_xmat[geoms] = pose
-        kind = os.environ.get("RHOK","0")
+        kind = os.environ.get("RHOK", "0")
         return middle, {"0": 0.0, "mean": sum(rho) / 2.0, "min": min(rho), "max": max(rho)}[kind]
 
     def _grasp(self, q: np.ndarray, others: tuple[str, ...]) -> Grasp:

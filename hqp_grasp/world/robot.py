@@ -361,15 +361,21 @@ class Robot:
         mujoco.mj_jac(self.model, data, J[:3], J[3:], self.palm(q)[0], self._palm[0])
         return J @ self.coupling
 
-    def opened(self, q: np.ndarray) -> np.ndarray:
-        """q (n,) with every finger open, until the first of its joints is at its range's end."""
+    def opened(self, q: np.ndarray, share: float = 0.0) -> np.ndarray:
+        """q (n,) with every finger open, or closed by a share of all it can.
+
+        A finger opens until the first of its joints is at the end of its range, and closes until
+        the last one is.
+        """
         q = q.copy()
         for w in self.closing:
             moving = w != 0.0
-            room = np.where(w > 0.0, q - self.q_lower, self.q_upper - q)[moving]
-            s = float((room / np.abs(w[moving])).min())
-            if np.isfinite(s):
-                q[moving] = np.clip(q - s * w, self.q_lower, self.q_upper)[moving]
+            way = np.abs(w[moving])
+            behind = np.where(w > 0.0, q - self.q_lower, self.q_upper - q)[moving] / way
+            ahead = np.where(w > 0.0, self.q_upper - q, q - self.q_lower)[moving] / way
+            if np.isfinite(behind).any():
+                s = (1.0 - share) * -behind.min() + share * (ahead.max() if share else 0.0)
+                q[moving] = np.clip(q + s * w, self.q_lower, self.q_upper)[moving]
         return q
 
     def grasp(

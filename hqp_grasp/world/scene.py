@@ -111,7 +111,9 @@ class Scene:
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled models stay in their process; the value is what travels.
-        return {name: getattr(self, name) for name in ("robot", "object", "position", "base", "hand")}
+        return {
+            name: getattr(self, name) for name in ("robot", "object", "position", "base", "hand")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
