@@ -46,7 +46,6 @@ class Contact:
     body: str = ""  # the link it belongs to
     point: np.ndarray | None = None  # (3,) [m], body frame: the point whose motion `jacobian` gives
     flexion: tuple[int, ...] = ()  # γ_i: indices into q of the joints that press this contact
-    closing: tuple[float, ...] = ()  # how these move together as it closes; (): each by itself
     tip_radius: float = 0.0  # [m] from `point` to the touching surface; 0 for a material point
     wrench: np.ndarray | None = None  # (6,) force [N], torque [N·m] on the tip, when sensed
     confidence: float = 1.0  # 0 … 1
@@ -69,11 +68,6 @@ class Contact:
             raise InputError(
                 f"Contact.flexion must list indices into q; got {self.flexion!r}"
             ) from error
-        set_field(self, "closing", tuple(number("Contact.closing", w) for w in self.closing))
-        if self.closing and len(self.closing) != len(self.flexion):
-            raise InputError(
-                f"Contact.closing has {len(self.closing)} weights for {len(self.flexion)} joints"
-            )
         set_field(self, "tip_radius", number("Contact.tip_radius", self.tip_radius))
         set_field(self, "confidence", number("Contact.confidence", self.confidence))
         if not (np.isfinite(self.tip_radius) and self.tip_radius >= 0.0):

@@ -107,9 +107,6 @@ class KinematicTask(Task):
         gamma = _flexion_columns(grasp)
         e, slope = self._error_and_slope(grasp, gamma)
         dJ_gamma = grasp.hessian.reshape(k, 3, n, n)[np.arange(k)[:, None], :, gamma]  # (k,g,3,n)
-        weights = _closing_weights(grasp, gamma)
-        if weights is not None:
-            dJ_gamma = np.einsum("kg,kgan->kan", weights, dJ_gamma)[:, None]
         J = slope.reshape(k, 1, -1) @ dJ_gamma.reshape(k, -1, n)  # (k, 1, n)
         return e, J[:, 0]
 
@@ -118,10 +115,7 @@ class KinematicTask(Task):
         # J_γᵀ of every contact (k, g, 3). A repeated index pads γ_i; its row is set to zero,
         # which changes neither error, and makes its slope zero too.
         JT = grasp._J3[np.arange(grasp.k)[:, None], :, gamma]
-        weights = _closing_weights(grasp, gamma)
-        if weights is not None:
-            JT = np.einsum("kg,kga->ka", weights, JT)[:, None]
-        elif gamma.shape[1] > 1:
+        if gamma.shape[1] > 1:
             JT[:, 1:][gamma[:, 1:] == gamma[:, :-1]] = 0.0
         if self.kind == "eq7":
             return _eq7(grasp.normals, JT)
@@ -139,19 +133,6 @@ def _flexion_columns(grasp: Grasp) -> np.ndarray:
             )
     g = max(map(len, sets))
     return np.array([gamma + gamma[-1:] * (g - len(gamma)) for gamma in sets])
-
-
-def _closing_weights(grasp: Grasp, gamma: np.ndarray) -> np.ndarray | None:
-    """Weight of each column of γ (k, g) where all fingers close along one direction, else None."""
-    import os
-
-    if gamma.shape[1] == 1 or not all(c.closing for c in grasp.contacts) or os.environ.get("ALLJ"):
-        return None
-    weights = np.zeros(gamma.shape)
-    for i, contact in enumerate(grasp.contacts):
-        for joint, weight in zip(contact.flexion, contact.closing, strict=True):
-            weights[i, int(np.argmax(gamma[i] == joint))] = weight
-    return weights
 
 
 def _eq7(normals: np.ndarray, JT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ CLOSE = (1e-9, 1e-8)  # [m]
 OVERLAP = 1e-7  # [m] a link this deep in the object touches it
 NEAR = 5e-3  # [m] gap below which Newton's method finds the touch
 MAX_CLOSING_STEPS = 2000  # tens, but for tips that graze
+TILT = 0.3  # [rad] over which the place of a touch is averaged on a link that is no ball
 CLEAR = 2e-3  # [m] a link is lifted by to be tilted free of the object
 REACH = 0.5  # [m] gaps beyond this are not measured
 ALL_THE_WAY = 100.0  # [rad] more than any range
@@ -256,22 +257,18 @@ class GeometricProbe:
         away = (link - thing) * (1.0 if gap > 0.0 else -1.0)
         return _Near(gap, link, away / np.linalg.norm(away), 0.0)
 
-    def _patch(self, i: int, near: _Near) -> np.ndarray:
-        """Where the middle of the touching patch is (3,) [m], world, on a link that is no ball.
+    def _patch(self, i: int, near: _Near) -> tuple[np.ndarray, float]:
+        """Middle of the touching patch (3,) [m], world, and the radius it is rounded by [m].
 
         A flat touches at the end that its least tilt chooses: the nearest point jumps by the
-        flat's length as that tilt changes sign. As seen over tilts of ±TILT about each tangent it
-        moves steadily, and its mean is (gap(+TILT) − gap(−TILT))/2 TILT: the gap's derivative with
-        the tilt is the nearest point's place.
+        flat's length as that tilt changes sign. Its mean over tilts of ±TILT about each tangent
+        moves steadily. Since the gap's derivative with the tilt is the nearest point's place, that
+        mean is (gap(+TILT) − gap(−TILT))/2 TILT; the radius is minus the second derivative.
         """
-        import os
-
-        TILT = float(os.environ.get("TILT", "0.3"))
-        model, data = self.scene.model, self._data
+        data = self._data
         geoms = list(self.scene.articulated.geoms[i])
         pose = data.geom_xpos[geoms].copy(), data.geom_xmat[geoms].copy()
-        middle = near.link.copy()
-        rho = []
+        middle, radius = near.link.copy(), 0.0
         one = np.cross(near.normal, np.eye(3)[np.abs(near.normal).argmin()])
         one /= np.linalg.norm(one)
         for tangent in (one, np.cross(near.normal, one)):
@@ -282,21 +279,18 @@ class GeometricProbe:
                 data.geom_xpos[geoms] = (pose[0] - near.link) @ R.T + lifted
                 data.geom_xmat[geoms] = (R @ pose[1].reshape(-1, 3, 3)).reshape(-1, 9)
                 gaps.append(min(self._distance(g, REACH) for g in geoms))
-            rho.append(max(0.0, (2.0 * (near.gap + CLEAR) - gaps[0] - gaps[1]) / TILT**2))
             middle += (gaps[0] - gaps[1]) / (2.0 * np.sin(TILT)) * tangent
+            radius += max(0.0, near.gap + CLEAR - sum(gaps) / 2.0) / TILT**2  # mean of two
         data.geom_xpos[geoms], data.geom_xmat[geoms] = pose
-        kind = os.environ.get("RHOK", "0")
-        return middle, {"0": 0.0, "mean": sum(rho) / 2.0, "min": min(rho), "max": max(rho)}[kind]
+        return middle, near.radius if near.radius > 0.0 else radius
 
     def _grasp(self, q: np.ndarray, others: tuple[str, ...]) -> Grasp:
         robot = self.scene.articulated
-        near = [self._nearest(i) for i in range(len(robot.geoms))]
-        places = [
-            (v.link, v.radius) if v.radius > 0.0 else self._patch(i, v) for i, v in enumerate(near)
-        ]
-        contacts = [
-            Contact(x[0], v.normal, tip_radius=x[1]) for x, v in zip(places, near, strict=True)
-        ]
+        contacts = []
+        for i, ball in enumerate(self._round):
+            near = self._nearest(i)
+            place, radius = (near.link, near.radius) if ball else self._patch(i, near)
+            contacts.append(Contact(place, near.normal, tip_radius=radius))
         return robot.grasp(q, contacts, others)
 
 

@@ -241,6 +241,8 @@ class RobotDescription:
             about = _description(path, data)
         except KeyError as error:
             raise ModelError(f"{path} lacks the entry {error}") from error
+        except ModelError as error:
+            raise ModelError(f"{path}: {error}") from error
         except (TypeError, AttributeError, InputError) as error:
             raise ModelError(f"{path}: an entry is of the wrong kind: {error}") from error
         if hand is not None:
@@ -476,7 +478,7 @@ def locate(text: str, folder: Path) -> Path:
 
 
 def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
-    _check(data, TOP, path.name)
+    _check(data, TOP)
     folder = path.parent
     model = data["model"]
     parts = model if isinstance(model, list) else [model]
@@ -654,14 +656,15 @@ def _known(kind: str, name: str, known: object, where: str) -> str:
     return name
 
 
-def _check(data: object, valid: tuple[str, ...], where: str) -> None:
+def _check(data: object, valid: tuple[str, ...], where: str = "") -> None:
+    """Raise for an entry that is not known, which would be ignored otherwise."""
     if not isinstance(data, Mapping):
-        raise InputError(f"{where} must be a table; got {data!r}")
+        raise InputError(f"{where or 'a description'} must be a table; got {data!r}")
     for key in data:
         if key not in valid:
             near = difflib.get_close_matches(key, valid, 1)
-            hint = f"did you mean {near[0]!r}? " if near else ""
-            raise ModelError(f"{where}: unknown key {key!r}; {hint}keys are: {', '.join(valid)}")
+            hint = f"did you mean {near[0]!r}? Entries" if near else "entries"
+            raise ModelError(f"unknown entry {key!r}; {hint} are: {', '.join(valid)}")
 
 
 def _text(value: object) -> str:

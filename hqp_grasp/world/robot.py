@@ -409,7 +409,6 @@ class Robot:
                     body=self.model.body(int(self._bodies[i])).name,
                     point=places[i],
                     flexion=self.flexion[i],
-                    closing=tuple(self.closing[i, list(self.flexion[i])].tolist()),
                     tip_radius=radius,
                 )
             )

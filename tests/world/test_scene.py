@@ -218,7 +218,7 @@ def test_an_unknown_robot_is_refused_before_anything_is_compiled():
 @pytest.mark.parametrize(
     "position",
     [(0.7, 0.0), (0.7, 0.0, 0.2, 0.0), 0.7, (0.7, np.nan, 0.2), (0.7, 0.0, np.inf), "abc",
-     ("a", "b", "c"), None],
+     ("a", "b", "c")],
     ids=str,
 )  # fmt: skip
 def test_a_position_is_three_finite_numbers(position):
