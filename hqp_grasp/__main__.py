@@ -13,6 +13,7 @@ from tyro.extras import SubcommandApp
 import hqp_grasp.scenarios
 from hqp_grasp.errors import HqpGraspError, one_of
 from hqp_grasp.experiments import report as reports
+from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.experiments.view import HOST, PORT, serve
 
 app = SubcommandApp()
@@ -60,6 +61,23 @@ def view(
         port: Port to listen on; 0 takes any free one.
     """
     serve(folder, compare, trial, host, port)
+
+
+@app.command
+def robot(
+    path: Positional[str],
+    /,
+    hand: str | None = None,
+    picture: Path | None = None,
+) -> None:
+    """Say how a robot was understood: joints, couplings, closing, palm, self-collisions.
+
+    Args:
+        path: A robot of this package by name, or a folder with a robot.toml, or such a file.
+        hand: The hand that grasps, of a robot with several.
+        picture: File to draw it into.
+    """
+    print(check(path, hand, picture))
 
 
 def main() -> None:

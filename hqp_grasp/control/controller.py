@@ -9,7 +9,13 @@ import numpy as np
 
 from hqp_grasp.control.forms import Form, Plan, form_of
 from hqp_grasp.control.landing import land
-from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, StepLimit
+from hqp_grasp.control.limits import (
+    ClearanceLimit,
+    ConfigurationLimit,
+    HoldLimit,
+    RetreatLimit,
+    StepLimit,
+)
 from hqp_grasp.errors import HqpGraspError, InputError
 from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.level import Solution
@@ -78,6 +84,11 @@ class Controller:
             stack = stack.within(StepLimit())
         if not any(limit.priority is Priority.RANGE for limit in stack.limits):
             stack = stack.within(ConfigurationLimit(self.robot))
+        if self.robot.idle.any() and not any(isinstance(v, HoldLimit) for v in stack.limits):
+            stack = stack.within(HoldLimit(self.robot))
+        watched = any(isinstance(v, ClearanceLimit) for v in stack.limits)
+        if self.robot.description.clearance > 0.0 and not watched:
+            stack = stack.within(ClearanceLimit(self.robot))
         object.__setattr__(self, "stack", stack)
         if isinstance(self.form, str):
             object.__setattr__(self, "form", form_of(self.form))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from hqp_grasp.grasp import Grasp, as_array
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks import Stack
 from hqp_grasp.tasks.limit import Limit, Priority
+from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.robot import Robot
 
 
@@ -82,6 +83,37 @@ class ConfigurationLimit(Limit):
             )
         A = grasp.coupling[limited]  # type: ignore[index]
         return Level(A, (lower - q)[limited], (upper - q)[limited], "range")
+
+
+@dataclass(frozen=True, eq=False)
+class HoldLimit(Limit):
+    """Joints that move no contact point, as those of the other arm, stay where they are."""
+
+    robot: Robot
+    priority = Priority.RANGE
+
+    def level(self, grasp: Grasp) -> Level:
+        A = np.eye(grasp.n)[self.robot.idle]
+        return Level.equal(A, np.zeros(len(A)), "hold")
+
+
+@dataclass(frozen=True, eq=False)
+class ClearanceLimit(Limit):
+    """The robot's own links keep apart, as its description says; those too near move apart."""
+
+    robot: Robot
+    within: float = 0.04  # [m] pairs farther apart than this are let be
+    priority = Priority.CLEARANCE
+    _links: SelfClearance = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        links = SelfClearance(self.robot, self.robot.description.clearance)
+        object.__setattr__(self, "_links", links)
+
+    def level(self, grasp: Grasp) -> Level:
+        near = self._links.near(grasp.q, self.within)
+        room = near.least - near.distance
+        return Level(near.jacobian, room, np.full(len(room), np.inf), "clearance")
 
 
 @dataclass(frozen=True, eq=False)

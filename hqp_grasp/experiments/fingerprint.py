@@ -92,8 +92,8 @@ class Fingerprint:
     def _held(self, value: object, at: str) -> dict[str, object]:
         """What an object is made of."""
         if isinstance(value, Robot):
-            # The description's file is compiled into the model, wherever it stands.
-            about = {k: v for k, v in vars(value.description).items() if k != "xml"}
+            # The description's files are compiled into the model, wherever they stand.
+            about = {k: v for k, v in vars(value.description).items() if k != "files"}
             return about | {"model": value.model}
         if isinstance(value, Scene):
             return {f.name: getattr(value, f.name) for f in fields(value)} | {

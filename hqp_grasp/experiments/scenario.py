@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -66,12 +66,23 @@ class Settings:
     links: Literal["block", "pass"] = "block"
     """Whether links other than the fingertips are stopped by the object, or pass through it, as in
     the paper."""
+    robot: str | None = None
+    """Another robot than the scenario's: a name, or the path of a description."""
+    hand: str | None = None
+    """The hand that grasps, of a robot with several: right or left."""
     replay: int = 0
     """The trial that replay.html plays."""
     view: bool = False
     """Open the live viewer at the end."""
     port: int = PORT
     """Where the viewer listens, on this machine only; 0: any free port."""
+
+    def scene(self, scene: Scene) -> Scene:
+        """The scenario's scene with the robot that was asked for, in that robot's workspace."""
+        if self.robot is None and self.hand is None:
+            return scene
+        robot = scene.robot if self.robot is None else self.robot
+        return replace(scene, robot=robot, hand=self.hand, position=None)
 
 
 def main(name: str, scene: Scene | Callable[[], Scene], settings: Settings | None = None) -> None:
@@ -100,6 +111,7 @@ def _about(name: str, scene: Scene) -> str:
 
 def trial_of(scene: Scene, settings: Settings) -> Trial:
     """The trial that the settings describe."""
+    scene = settings.scene(scene)
     stack = stack_of(settings.stack, settings.kinematic_error)
     stack = stack.within(
         StepLimit(settings.joint_cap, settings.contact_cap), ConfigurationLimit(scene.articulated)
@@ -119,6 +131,7 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
 
     Raises TrialError where every trial ends in an error, or, if strict, where one does.
     """
+    scene = settings.scene(scene)
     trial = trial_of(scene, settings)
     out = _out(name, settings)
     study = Study(trial, settings.trials, settings.seed, settings.jobs, settings.strict)

@@ -19,7 +19,7 @@ from hqp_grasp.errors import InputError, ModelError, number, one_of, positive
 from hqp_grasp.grasp import as_array
 
 SPEED, SLIDE_SPEED = 1.0, 0.25  # [rad/s], [m/s] of joints for which a description gives none
-CLEARANCE = 0.002  # [m] that links keep between them
+CLEARANCE = 0.005  # [m] that links keep between them
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo loads
 # Nearest points of meshes and boxes: with MuJoCo's defaults their direction is off by 4e-3 at a gap
 # of 1e-6 m, with these by 2e-6 down to 1e-9 m. For balls, whose centre gives the direction, the

@@ -1,0 +1,183 @@
+"""What a robot's description amounts to, in words and as a picture: python -m hqp_grasp robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import mujoco
+import numpy as np
+
+from hqp_grasp.world.clearance import SelfClearance
+from hqp_grasp.world.description import CARRIAGE, RobotDescription
+from hqp_grasp.world.robot import CAPSULE, SPHERE, Robot, compiled
+from hqp_grasp.world.second_opinion import second_opinion
+
+AGREES = 1e-6  # [m] two readings of a file that differ by less are the same
+
+
+def check(path: str | Path, hand: str | None = None, picture: str | Path | None = None) -> str:
+    """Describe a robot as it was understood; raise ModelError for one that cannot grasp.
+
+    `picture` is the file of a drawing with its contact points and the ways they close.
+    """
+    about = RobotDescription.load(path, hand)
+    robot = Robot(about, compiled(about))
+    clearance = SelfClearance(robot, max(about.clearance, 1e-4))
+    text = "\n".join(
+        [
+            f"{about.name}: {robot.n} independent joints, {robot.model.njnt} in all; hands: "
+            f"{', '.join(h.name for h in about.hands)} ({about.hand.name} grasps)",
+            *_files(about),
+            "",
+            *_joints(robot),
+            "",
+            *_contact_points(robot),
+            "",
+            *_palm(robot),
+            "",
+            *_self_collisions(robot, clearance),
+        ]
+    )
+    if picture is not None:
+        draw(robot, picture)
+        text += f"\n\npicture  {picture}"
+    return text
+
+
+def _files(about: RobotDescription) -> list[str]:
+    lines = []
+    for part in about.files:
+        both = second_opinion(part)
+        if both.reason:
+            told = both.reason
+        else:
+            same = max(both.position, both.jacobian) < AGREES
+            told = (
+                f"MuJoCo and Pinocchio {'agree' if same else 'DIFFER'}: {both.position:.0e} m, "
+                f"{both.jacobian:.0e} m/rad"
+            )
+        lines.append(f"  {part.file.name}: {told}")
+    return lines
+
+
+def _joints(robot: Robot) -> list[str]:
+    names = [robot.model.joint(j).name for j in range(robot.model.njnt)]
+    width = max(map(len, robot.joints))
+    lines = [f"{'joint':{width}}  {'range':>16}  {'home':>7}  {'speed':>6}  drives"]
+    for j, joint in enumerate(robot.joints):
+        driven = [
+            f"{names[i]} = {robot.coupling[i, j]:.3g}·" + (f" + {c:.3g}" if c else "")
+            for i in np.flatnonzero(robot.coupling[:, j])
+            if names[i] != joint
+            for c in [robot.offset[i]]
+        ]
+        ends = f"{robot.q_lower[j]:.2f} … {robot.q_upper[j]:.2f}"
+        role = ", ".join(driven) or ("moves no contact point: held" if robot.idle[j] else "")
+        lines.append(
+            f"{joint:{width}}  {ends:>16}  {robot.home[j]:7.2f}  {robot.velocity[j]:6.2f}  {role}"
+        )
+    return lines
+
+
+def _contact_points(robot: Robot) -> list[str]:
+    about, model = robot.description, robot.model
+    lines = ["contact points"]
+    J = robot.jacobian(robot.home).reshape(-1, 3, robot.n)
+    x = robot.centers(robot.home)
+    for i, point in enumerate(about.contact_points):
+        kinds = [_shape(model, g) for g in robot.geoms[i]]
+        closing = ", ".join(
+            f"{robot.joints[j]} {robot.closing[i, j]:+.2g}" for j in robot.flexion[i]
+        )
+        found = "" if point.closing is not None else " (found by itself; flexion = {…} says other)"
+        lines.append(f"  {point.name} on {point.link or _link(robot, i)}: {', '.join(kinds)}")
+        lines.append(f"    closes with {closing or 'nothing'}{found}")
+        others = np.delete(x, i, axis=0)
+        if len(others) and robot.closing[i].any():
+            towards = others.mean(axis=0) - x[i]
+            speed = float(J[i] @ robot.closing[i] @ towards / np.linalg.norm(towards))
+            way = "towards" if speed > 0.0 else "AWAY FROM"
+            lines.append(f"    at home it moves {way} the others at {1e3 * speed:+.0f} mm/rad")
+    return lines
+
+
+def _shape(model: mujoco.MjModel, geom: int) -> str:
+    kind = int(model.geom_type[geom])
+    if kind == SPHERE:
+        return f"ball of {1e3 * model.geom_size[geom, 0]:.3g} mm"
+    if kind == CAPSULE:
+        return f"capsule of {1e3 * model.geom_size[geom, 0]:.3g} mm"
+    name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+    return f"{name} (its touching patch counts by its middle)"
+
+
+def _link(robot: Robot, i: int) -> str:
+    return robot.model.body(int(robot.model.geom_bodyid[robot.geoms[i][0]])).name
+
+
+def _palm(robot: Robot) -> list[str]:
+    about = robot.description
+    arm = [robot.joints[j] for j in robot.arm]
+    carried = "six virtual joints" if arm == list(CARRIAGE) else ", ".join(arm)
+    lines = [f"arm      {carried or 'none: the hand is placed where a start says'}"]
+    body, p, R = robot._palm
+    place = (
+        f"palm = {{ body = {robot.model.body(body).name!r}, pos = {_row(p)}, "
+        f"approach = {_row(R[:, 2])}, opposition = {_row(R[:, 0])} }}"
+    ).replace("'", '"')
+    if about.hand.palm is None:
+        lines += ["palm     none given; found from how the fingers close. To fix it, add", place]
+    else:
+        lines.append(place)
+    if about.workspace is None:
+        lines += ["workspace  none given; amid the tips at home. To fix it, add"]
+    lines.append(f"workspace = {_row(np.array(robot.workspace))}")
+    return lines
+
+
+def _row(v: np.ndarray) -> str:
+    return "[" + ", ".join(f"{x + 0.0:.3f}" for x in v) + "]"
+
+
+def _self_collisions(robot: Robot, clearance: SelfClearance) -> list[str]:
+    lines = [
+        f"clearance  {1e3 * robot.description.clearance:.3g} mm, watched over "
+        f"{len(clearance.pairs)} pairs of geoms"
+    ]
+    if clearance.at_home:
+        pairs = ", ".join(f"{a} – {b}" for a, b in clearance.at_home[:8])
+        more = f", and {len(clearance.at_home) - 8} more" if len(clearance.at_home) > 8 else ""
+        lines.append(f"  touch at home, taken to be so by design: {pairs}{more}")
+    return lines
+
+
+def draw(robot: Robot, path: str | Path) -> None:
+    """Draw links as lines, contact points and the ways they close, at home."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    model = robot.model
+    data = mujoco.MjData(model)
+    robot.place(data, robot.home)
+    figure = plt.figure(figsize=(7, 7))
+    axes = figure.add_subplot(projection="3d")
+    for body in range(1, model.nbody):
+        ends = data.xpos[[body, model.body_parentid[body]]]
+        if model.body_parentid[body] > 0:
+            axes.plot(*ends.T, color="0.5", linewidth=2)
+    x = robot.centers(robot.home)
+    J = robot.jacobian(robot.home).reshape(-1, 3, robot.n)
+    ways = np.einsum("kan,kn->ka", J, robot.closing)
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
+    axes.scatter(*x.T, color="tab:orange")
+    axes.quiver(*x.T, *ways.T, length=0.04, color="tab:orange", label="closing")
+    p, R = robot.palm(robot.home)
+    axes.quiver(*p, *R[:, 2], length=0.08, color="tab:blue", label="approach")
+    axes.quiver(*p, *R[:, 0], length=0.05, color="tab:green", label="opposition")
+    for point, place in zip(robot.description.contact_points, x, strict=True):
+        axes.text(*place, point.name)
+    axes.set_aspect("equal")
+    axes.legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

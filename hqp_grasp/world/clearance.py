@@ -1,0 +1,122 @@
+"""How near a robot's own links are to one another, and how that changes with the joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from hqp_grasp.world.robot import Robot
+
+TOUCHES = 1e-6  # [m] links nearer than this touch
+
+
+@dataclass(frozen=True, eq=False)
+class Clearances:
+    """Pairs of links that come near, the nearest pair of their geoms each."""
+
+    names: tuple[tuple[str, str], ...]  # m pairs of geoms
+    distance: np.ndarray  # (m,) [m] negative where they overlap
+    least: np.ndarray  # (m,) [m] that they are to keep
+    jacobian: np.ndarray  # (m, n) [m/rad] ∂distance/∂q
+
+
+@dataclass(frozen=True, eq=False)
+class SelfClearance:
+    """The pairs of a robot's geoms that are to stay apart by `least` [m].
+
+    Left out are pairs that cannot move against one another or share a joint, that the model
+    excludes, and that touch at home by design. A pair that is nearer than twice `least` at home
+    keeps half of what it has there.
+    """
+
+    robot: Robot
+    least: float  # [m]
+    pairs: np.ndarray = field(init=False)  # (p, 2) geom ids
+    _least: np.ndarray = field(init=False, repr=False)  # (p,) [m]
+    at_home: tuple[tuple[str, str], ...] = field(init=False)  # pairs that touch there
+
+    def __post_init__(self) -> None:
+        robot, model = self.robot, self.robot.model
+        pairs = _pairs(robot)
+        data = mujoco.MjData(model)
+        robot.place(data, robot.home)
+        far = 2.0 * self.least + TOUCHES
+        home = np.full(len(pairs), far)
+        for i in np.flatnonzero(_bound(model, data, pairs) < far):
+            home[i] = mujoco.mj_geomDistance(model, data, *map(int, pairs[i]), far, None)
+        apart = home > TOUCHES
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        put("pairs", pairs[apart])
+        put("_least", np.minimum(self.least, 0.5 * home[apart]))
+        put("at_home", tuple(_names(model, pair) for pair in pairs[~apart]))
+
+    def near(self, q: np.ndarray, within: float) -> Clearances:
+        """The pairs nearer than `within` [m] at q (n,)."""
+        robot, model = self.robot, self.robot.model
+        data = robot._at(q)
+        mujoco.mj_comPos(model, data)
+        names, distances, least, rows = [], [], [], []
+        for i in np.flatnonzero(_bound(model, data, self.pairs) < within):
+            one, other = map(int, self.pairs[i])
+            ends = np.zeros(6)
+            distance = mujoco.mj_geomDistance(model, data, one, other, within, ends)
+            away = ends[:3] - ends[3:]
+            length = float(np.linalg.norm(away))
+            if distance >= within or length < TOUCHES:
+                continue
+            J = np.zeros((2, 3, model.nv))
+            for J_end, end, geom in zip(J, (ends[:3], ends[3:]), (one, other), strict=True):
+                body = int(model.geom_bodyid[geom])
+                mujoco.mj_jac(model, data, J_end, None, end, body)
+            names.append(_names(model, self.pairs[i]))
+            distances.append(distance)
+            least.append(self._least[i])
+            rows.append(np.sign(distance) * away / length @ (J[0] - J[1]) @ robot.coupling)
+        return Clearances(
+            tuple(names), np.array(distances), np.array(least), np.reshape(rows, (-1, robot.n))
+        )
+
+    def collisions(self, q: np.ndarray) -> tuple[tuple[str, str], ...]:
+        """The pairs that overlap at q (n,)."""
+        near = self.near(q, 10.0 * TOUCHES)
+        return tuple(n for n, d in zip(near.names, near.distance, strict=True) if d < -TOUCHES)
+
+
+def _pairs(robot: Robot) -> np.ndarray:
+    """Geoms (p, 2) that collide and move against one another."""
+    model = robot.model
+    weld = model.body_weldid
+    above = weld[model.body_parentid[weld]]  # the next link towards the base
+    excluded = set(model.exclude_signature.tolist())
+    roots = set(model.body_rootid[[model.jnt_bodyid[j] for j in range(model.njnt)]].tolist())
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    own = [
+        int(g)
+        for g in np.flatnonzero(touching)
+        if model.geom_bodyid[g] and model.body_rootid[model.geom_bodyid[g]] in roots
+    ]
+    pairs = []
+    for i, one in enumerate(own):
+        for other in own[i + 1 :]:
+            a, b = int(model.geom_bodyid[one]), int(model.geom_bodyid[other])
+            u, v = int(weld[a]), int(weld[b])
+            if u == v or above[a] == v or above[b] == u:
+                continue
+            if (a << 16) + b in excluded or (b << 16) + a in excluded:
+                continue
+            pairs.append((one, other))
+    return np.reshape(pairs, (-1, 2)).astype(int)
+
+
+def _bound(model: mujoco.MjModel, data: mujoco.MjData, pairs: np.ndarray) -> np.ndarray:
+    """Distances (p,) [m] that the pairs are at least apart by."""
+    one, other = pairs.T
+    centres = np.linalg.norm(data.geom_xpos[one] - data.geom_xpos[other], axis=1)
+    return centres - model.geom_rbound[one] - model.geom_rbound[other]
+
+
+def _names(model: mujoco.MjModel, pair: np.ndarray) -> tuple[str, str]:
+    one, other = (model.geom(int(g)).name for g in pair)
+    return one, other
