@@ -10,7 +10,7 @@ import numpy as np
 
 from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.description import CARRIAGE, RobotDescription
-from hqp_grasp.world.robot import CAPSULE, SPHERE, Robot, compiled
+from hqp_grasp.world.robot import CAPSULE, SPHERE, Robot, compiled, described
 from hqp_grasp.world.second_opinion import second_opinion
 
 AGREES = 1e-6  # [m] two readings of a file that differ by less are the same
@@ -21,7 +21,7 @@ def check(path: str | Path, hand: str | None = None, picture: str | Path | None 
 
     `picture` is the file of a drawing with its contact points and the ways they close.
     """
-    about = RobotDescription.load(path, hand)
+    about = described(path, hand)
     robot = Robot(about, compiled(about))
     clearance = SelfClearance(robot, max(about.clearance, 1e-4))
     text = "\n".join(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import mujoco
@@ -22,8 +23,10 @@ OVERLAP = 1e-7  # [m] a link this deep in the object touches it
 NEAR = 5e-3  # [m] gap below which Newton's method finds the touch
 MAX_CLOSING_STEPS = 2000  # tens, but for tips that graze
 TILT = 0.3  # [rad] over which the place of a touch is averaged on a link that is no ball
+FAR = 2e-2  # [m] beyond this from the object a finger does not aim at it
 CLEAR = 2e-3  # [m] a link is lifted by to be tilted free of the object
 REACH = 0.5  # [m] gaps beyond this are not measured
+ANYWHERE = 100.0  # [m]
 ALL_THE_WAY = 100.0  # [rad] more than any range
 
 
@@ -97,12 +100,23 @@ class GeometricProbe:
         """Move to q_target (n,) [rad], close every finger, and return the grasp felt there."""
         robot = self.scene.articulated
         q_target = robot.require_q("q_target", q_target).copy()
-        found = self._close(q_target, list(robot.closing))
+        ways = list(robot.closing)
+        found = self._close(q_target, ways)
         if isinstance(found, Missed):
-            return found
-        again = self._aimed(q_target, *found)
-        if again is not None:
-            pressed = self._close(q_target, again)
+            # A finger may pass the object by: then each closes towards what is nearest to it.
+            robot.place(self._data, q_target)
+            aimed = self._aimed(q_target, ways, range(len(ways)))
+            if found.reason is not Miss.NO_TOUCH or aimed is None:
+                return found
+            found = self._close(q_target, aimed)
+            if isinstance(found, Missed):
+                return found
+        q, fingers = found
+        ways = [f.way for f in fingers]
+        near = [i for i, f in enumerate(fingers) if abs(f.s) <= RETREAT]
+        aimed = self._aimed(q, ways, near)
+        if aimed is not None:
+            pressed = self._close(q_target, aimed)
             found = found if isinstance(pressed, Missed) else pressed
         q = found[0]
         robot.place(self._data, q)
@@ -144,7 +158,7 @@ class GeometricProbe:
                     return self._missed(Miss.NO_TOUCH, i)
                 goal = f.gap - (0.0 if self._round[i] else sum(CLOSE) / 2.0)
                 step = goal / speed[i]  # cannot pass the first touch
-                if f.gap < NEAR:
+                if f.gap < NEAR and (f.gap > 0.0 or self._round[i]):
                     closing = self._closing_speed(q, i, f.way)
                     if closing > 0.05 * speed[i]:
                         step = goal / closing
@@ -157,24 +171,22 @@ class GeometricProbe:
         return self._missed(Miss.NO_TOUCH, moving[0])
 
     def _aimed(
-        self, q_target: np.ndarray, q: np.ndarray, fingers: list[_Finger]
+        self, q: np.ndarray, ways: list[np.ndarray], which: Iterable[int]
     ) -> list[np.ndarray] | None:
-        """The ways that change the fingers least, or None where the described ones are these."""
+        """The ways that change these fingers least, w = −(nᵀJ_γ)⁺, or None where `ways` are."""
         robot = self.scene.articulated
-        ways = []
-        for i, f in enumerate(fingers):
-            gamma = robot.flexion[i]
-            way = f.way
-            if len(gamma) > 1 and abs(f.s) <= RETREAT:
-                near = self._nearest(i)
-                J = self._jacobian(q, i, near.link)[:, gamma]
-                aimed = -(near.normal @ J)
-                if np.abs(aimed).max() > 0.0:
-                    way = np.zeros_like(f.way)
-                    way[list(gamma)] = aimed / np.abs(aimed).max()
-            ways.append(way)
-        same = all(np.array_equal(way, f.way) for way, f in zip(ways, fingers, strict=True))
-        return None if same else ways
+        aimed = list(ways)
+        for i in which:
+            gamma = list(robot.flexion[i])
+            near = self._nearest(i)
+            if len(gamma) == 1 or near.gap >= FAR:
+                continue
+            way = -(near.normal @ self._jacobian(q, i, near.link)[:, gamma])
+            if np.abs(way).max() > 0.0:
+                aimed[i] = np.zeros_like(ways[i])
+                aimed[i][gamma] = way / np.abs(way).max()
+        same = all(np.array_equal(way, other) for way, other in zip(ways, aimed, strict=True))
+        return None if same else aimed
 
     def _touches(self, i: int, gap: float) -> bool:
         return abs(gap) <= TOUCH if self._round[i] else CLOSE[0] <= gap <= CLOSE[1]
@@ -196,8 +208,8 @@ class GeometricProbe:
         room = np.where(way > 0.0, robot.q_upper - q_target, robot.q_lower - q_target)[moving]
         return -min(ALL_THE_WAY, float((room / way[moving]).max()))
 
-    def _measure(self, q: np.ndarray, fingers: list[_Finger], which: object) -> None:
-        for i in which:  # type: ignore[attr-defined]
+    def _measure(self, q: np.ndarray, fingers: list[_Finger], which: Iterable[int]) -> None:
+        for i in which:
             f = fingers[i]
             f.gap = min(self._distance(g, REACH) for g in self.scene.articulated.geoms[i])
             if f.gap < 0.0:
@@ -242,7 +254,7 @@ class GeometricProbe:
         found = []
         for geom in self.scene.articulated.geoms[i]:
             ends = np.zeros(6)
-            found.append((self._distance(geom, REACH, ends), geom, ends[:3], ends[3:]))
+            found.append((self._distance(geom, ANYWHERE, ends), geom, ends[:3], ends[3:]))
         gap, geom, link, thing = min(found, key=lambda near: near[0])
         kind, radius = model.geom_type[geom], 0.0
         if kind in (SPHERE, CAPSULE):

@@ -322,10 +322,7 @@ class RobotDescription:
         """Six joints at the root: at zero the palm is held as a drawn start holds it."""
         palm, roots = self.hand.palm, spec.worldbody.bodies
         if palm is None:
-            raise ModelError(
-                f"{self.name}: a carriage needs a palm = {{body = ..., approach = ..., opposition "
-                "= ...} to know how it is to hold the hand"
-            )
+            raise ModelError(f"{self.name}: a carriage needs a palm to hold the hand by")
         if len(roots) != 1 or roots[0].joints or spec.worldbody.geoms:
             raise ModelError(f"{self.name}: a carriage carries one root body without joints")
         alone = replace(self, carriage=False).spec()
@@ -367,7 +364,7 @@ class RobotDescription:
                 )
         for equality in list(spec.equalities):
             drop = self.drop_couplings
-            if drop is True or (drop and {equality.name, equality.name1} & set(drop)):  # type: ignore[arg-type]
+            if drop is True or (drop and {equality.name, equality.name1} & set(drop)):
                 spec.delete(equality)
         for coupling in self.couplings:
             one = joints[self._joint(coupling.joint, joints, "couplings")]
@@ -562,10 +559,8 @@ def _palm(data: object) -> Palm:
         return Palm(_text(data))
     _check(data, KEYS["palm"], "palm")
     vectors = ("pos", "approach", "opposition")
-    palm = Palm(
-        body=_text(data["body"]),
-        **{key: _vector(f"palm.{key}", data[key]) for key in vectors if key in data},
-    )
+    given = {key: _vector(f"palm.{key}", data[key]) for key in vectors if key in data}
+    palm = Palm("", _text(data["body"]), **given)
     _axes(palm)
     return palm
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ from hqp_grasp.world.description import (
     SLIDE_SPEED,
     SPEED,
     ContactPoint,
+    Palm,
     RobotDescription,
     ball_name,
     nearest,
@@ -112,7 +114,7 @@ class Robot:
         put("_palm", self._find_palm())
         fingers = {j for joints in self.flexion for j in joints}
         if about.hand.arm is None:
-            carries = C[_chain(model, self._palm[0])].any(axis=0)
+            carries = np.abs(C[_chain(model, self._palm[0])]).sum(axis=0) > 0.0
             arm = tuple(j for j in range(self.n) if carries[j] and j not in fingers)
         else:
             arm = tuple(self.index(joint) for joint in about.arm)
@@ -122,20 +124,20 @@ class Robot:
 
     def _refuse_stuck(self, names: Sequence[str]) -> None:
         """Raise where couplings leave a joint no range, or a single angle."""
-        for j in np.flatnonzero(~(self.q_lower < self.q_upper)):
+        for j in np.flatnonzero(~(self.q_lower < self.q_upper)).tolist():
             joint, low, high = self.joints[j], self.q_lower[j], self.q_upper[j]
             driven = [
                 f"{names[i]} = {self.coupling[i, j]:g}·{joint} + {self.offset[i]:g} must stay in "
                 f"[{self.lower[i]:g}, {self.upper[i]:g}]"
-                for i in np.flatnonzero(self.coupling[:, j])
+                for i in np.flatnonzero(self.coupling[:, j]).tolist()
                 if names[i] != joint
             ]
             left = f"only the angle {low:g}" if low == high else "no angle at all"
             raise ModelError(
                 f"couplings and ranges leave joint {joint!r} of {self.description.name} {left}"
                 + "".join(f"; {what}" for what in driven)
-                + f'; drop_couplings = ["{names[np.flatnonzero(self.coupling[:, j])[-1]]}"] frees '
-                "it, ranges or lock say otherwise"
+                + f'; drop_couplings = ["{names[int(np.flatnonzero(self.coupling[:, j])[-1])]}"] '
+                "frees it, ranges or lock say otherwise"
             )
 
     def _velocity(self, independent: list[int]) -> np.ndarray:
@@ -238,15 +240,18 @@ class Robot:
             return int(model.site_bodyid[site]), model.site_pos[site].copy(), R.reshape(3, 3)
         above = [_ancestors(model, body) for body in self._bodies]
         body = next(b for b in above[0] if all(b in others for others in above))
-        half = self.home + 0.5 * np.clip(
-            self.closing.sum(axis=0), self.q_lower - self.home, self.q_upper - self.home
+        room = np.clip(self.closing.sum(axis=0), self.q_lower - self.home, self.q_upper - self.home)
+        half = self.home + 0.5 * room
+        v = np.einsum(
+            "kaj,kj->ka", self.jacobian(half).reshape(len(above), 3, self.n), self.closing
         )
-        J = self.jacobian(half).reshape(len(above), 3, self.n)
         data = self._at(half)
-        v = np.einsum("kaj,kj->ka", J, self.closing)
-        x = np.linalg.eigh(v.T @ v)[1][:, -1]
         z = self.centers(half).mean(axis=0) - data.xpos[body]
-        z = z / np.linalg.norm(z) if np.linalg.norm(z) > 1e-6 else np.linalg.eigh(v.T @ v)[1][:, 0]
+        if np.linalg.norm(z) < CENTRED:
+            z = np.linalg.eigh(v.T @ v)[1][:, 0]
+        z = z / np.linalg.norm(z)
+        across = v - np.outer(v @ z, z)
+        x = np.linalg.eigh(across.T @ across - np.outer(z, z))[1][:, -1]
         x = x - (x @ z) * z
         x /= np.linalg.norm(x)
         R = data.xmat[body].reshape(3, 3).T @ np.column_stack([x, np.cross(z, x), z])
@@ -469,6 +474,20 @@ def _id(
             f"{word}s are: {', '.join(n for n in names if n) or 'none'}"
         )
     return i
+
+
+def described(robot: str | Path, hand: str | None = None) -> RobotDescription:
+    """A robot's description; where a carriage has no palm to hold it by, with the one found."""
+    about = RobotDescription.load(robot, hand)
+    if about.carriage and about.hand.palm is None:
+        alone = replace(about, carriage=False)
+        found = Robot(alone, compiled(alone))
+        body, p, R = found._palm
+        name = found.model.body(body).name
+        palm = Palm("", name, tuple(p.tolist()), tuple(R[:, 2].tolist()), tuple(R[:, 0].tolist()))
+        hands = [replace(h, palm=palm) if h is about.hand else h for h in about.hands]
+        about = replace(about, hands=tuple(hands))
+    return about
 
 
 def compiled(description: RobotDescription) -> mujoco.MjModel:

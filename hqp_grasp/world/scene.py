@@ -15,7 +15,7 @@ from hqp_grasp.errors import HqpGraspError, InputError, ResultsError
 from hqp_grasp.grasp import as_array
 from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
-from hqp_grasp.world.robot import Robot, compiled
+from hqp_grasp.world.robot import Robot, compiled, described
 
 CAN = Cylinder(radius=0.05)  # the paper's first object
 
@@ -39,7 +39,7 @@ class Scene:
             raise InputError(
                 f"unknown object {self.object!r}; choose one of: Cylinder, Prism, Body"
             )
-        description = RobotDescription.load(self.robot, self.hand)
+        description = described(self.robot, self.hand)
         object.__setattr__(self, "_description", description)
         if self.position is None:
             workspace = description.workspace

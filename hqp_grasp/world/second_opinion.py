@@ -75,7 +75,7 @@ def second_opinion(part: ModelFile) -> Agreement:
             apart = np.abs(theirs.actInv(scratch.oMf[frame]).translation - x).max()
             turned = np.abs(theirs.rotation.T @ J_other - ours.rotation.T @ J).max()
             worst = np.maximum(worst, [apart, turned])
-    return Agreement(name, *worst.tolist())
+    return Agreement(name, float(worst[0]), float(worst[1]))
 
 
 def _pose(p: np.ndarray, R: np.ndarray) -> pin.SE3:
