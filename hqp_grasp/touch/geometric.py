@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -30,25 +32,13 @@ ANYWHERE = 100.0  # [m]
 ALL_THE_WAY = 100.0  # [rad] more than any range
 
 
-@dataclass(frozen=True, eq=False)
-class _Near:
+class _Near(NamedTuple):
     """Where a link and the object are nearest to one another."""
 
     gap: float  # [m] negative inside
     link: np.ndarray  # (3,) [m] of the link's surface, world
     normal: np.ndarray  # (3,) outward from the object
     radius: float  # [m] that the link is rounded by there
-
-
-@dataclass
-class _Finger:
-    """One finger on its way: q(s) = clip(q_target + s·way)."""
-
-    way: np.ndarray  # (n,) signed; its fastest joint moves by 1 rad while s grows by 1
-    s: float = 0.0  # [rad]
-    gap: float = np.inf
-    free: float = -np.inf  # the largest s known to touch nothing
-    inside: float = np.inf  # the smallest s known to be inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +63,7 @@ class GeometricProbe:
     _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch
     _objects: tuple[int, ...] = field(init=False, repr=False)  # geom ids of what is felt
     _round: tuple[bool, ...] = field(init=False, repr=False)  # each contact point is one ball
+    _may_aim: bool = field(init=False, repr=False)  # some finger closes with several joints
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
@@ -83,6 +74,7 @@ class GeometricProbe:
                 raise InputError(f"{point.name} has no flexion joint, and so cannot close")
         put("_local", threading.local())
         put("_round", tuple(bool(radius > 0.0) for radius in robot.tip_radius))
+        put("_may_aim", any(len(gamma) > 1 for gamma in robot.flexion))
         touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         tips = {g for geoms in robot.geoms for g in geoms}
         objects = touching & (model.geom_bodyid == model.body(OBJECT).id)
@@ -100,22 +92,21 @@ class GeometricProbe:
         """Move to q_target (n,) [rad], close every finger, and return the grasp felt there."""
         robot = self.scene.articulated
         q_target = robot.require_q("q_target", q_target).copy()
-        ways = list(robot.closing)
+        ways = robot.closing
         found = self._close(q_target, ways)
         if isinstance(found, Missed):
             # A finger may pass the object by: then each closes towards what is nearest to it.
-            robot.place(self._data, q_target)
-            aimed = self._aimed(q_target, ways, range(len(ways)))
-            if found.reason is not Miss.NO_TOUCH or aimed is None:
+            if found.reason is not Miss.NO_TOUCH or not self._may_aim:
                 return found
-            found = self._close(q_target, aimed)
+            robot.place(self._data, q_target)
+            ways = self._aimed(q_target, ways, range(len(ways)))
+            found = self._close(q_target, ways)
             if isinstance(found, Missed):
                 return found
-        q, fingers = found
-        ways = [f.way for f in fingers]
-        near = [i for i, f in enumerate(fingers) if abs(f.s) <= RETREAT]
-        aimed = self._aimed(q, ways, near)
-        if aimed is not None:
+        if self._may_aim:
+            q, closed = found
+            near = [i for i, s in enumerate(closed) if abs(s) <= RETREAT]
+            aimed = self._aimed(q, ways, near)
             pressed = self._close(q_target, aimed)
             found = found if isinstance(pressed, Missed) else pressed
         q = found[0]
@@ -130,104 +121,94 @@ class GeometricProbe:
         return self._grasp(q, others)
 
     def _close(
-        self, q_target: np.ndarray, ways: list[np.ndarray]
-    ) -> tuple[np.ndarray, list[_Finger]] | Missed:
-        """Open by RETREAT, then close every finger its way: the posture that touches."""
+        self, q_target: np.ndarray, ways: np.ndarray
+    ) -> tuple[np.ndarray, list[float]] | Missed:
+        """Open by RETREAT, then close every finger its way, q(s) = clip(q_target + s·way).
+
+        `ways` (k, n) are signed; a finger's fastest joint moves by 1 rad while its s grows by 1.
+        Returns the posture that touches, q (n,) [rad], and s (k) [rad] there.
+        """
         robot = self.scene.articulated
-        fingers = [_Finger(way, -RETREAT) for way in ways]
-        q = self._posture(q_target, fingers)
-        self._measure(q, fingers, range(len(fingers)))
-        if min(f.gap for f in fingers) < 0.0:
-            for f in fingers:
-                f.s, f.free, f.inside = self._end(q_target, -f.way), -np.inf, np.inf
-            q = self._posture(q_target, fingers)
-            self._measure(q, fingers, range(len(fingers)))
-            if min(f.gap for f in fingers) < 0.0:
-                return self._missed(Miss.INSIDE, int(np.argmin([f.gap for f in fingers])))
-        speed = [
-            float(np.abs(f.way) @ reach) for f, reach in zip(fingers, robot.reach, strict=True)
+        k, q = len(ways), q_target.copy()
+        lower, upper, start = robot.q_lower.tolist(), robot.q_upper.tolist(), q_target.tolist()
+        joints = [
+            [(j, start[j], lower[j], upper[j], speed) for j, speed in enumerate(way) if speed]
+            for way in ways.tolist()
         ]
-        ends = [-self._end(q_target, f.way) for f in fingers]
+
+        def place(s: list[float], which: Iterable[int]) -> None:
+            for i in which:
+                for j, at, low, high, speed in joints[i]:
+                    q[j] = min(max(at + s[i] * speed, low), high)
+            robot.place(self._data, q)
+
+        s = [-RETREAT] * k
+        place(s, range(k))
+        gaps = [self._gap(i) for i in range(k)]
+        if min(gaps) < 0.0:
+            s = [_way_left(finger, -1.0) for finger in joints]
+            place(s, range(k))
+            gaps = [self._gap(i) for i in range(k)]
+            if min(gaps) < 0.0:
+                return self._missed(Miss.INSIDE, int(np.argmin(gaps)))
+        fastest = np.einsum("kn,kn->k", np.abs(ways), robot.reach).tolist()
+        ends = [_way_left(finger, 1.0) for finger in joints]
+        free, inside = list(s), [np.inf] * k  # where each finger is known to be so
         for _ in range(MAX_CLOSING_STEPS):
-            moving = [i for i, f in enumerate(fingers) if not self._touches(i, f.gap)]
+            moving = [i for i in range(k) if not self._touches(i, gaps[i])]
             if not moving:
-                return q, fingers
+                return q, s
+            J = None  # of balls' centres: along the normal they move as the touching points do
             for i in moving:
-                f = fingers[i]
-                if f.s >= ends[i] and f.gap > 0.0:
+                if s[i] >= ends[i] and gaps[i] > 0.0:
                     return self._missed(Miss.NO_TOUCH, i)
-                goal = f.gap - (0.0 if self._round[i] else sum(CLOSE) / 2.0)
-                step = goal / speed[i]  # cannot pass the first touch
-                if f.gap < NEAR and (f.gap > 0.0 or self._round[i]):
-                    closing = self._closing_speed(q, i, f.way)
-                    if closing > 0.05 * speed[i]:
-                        step = goal / closing
-                s = f.s + step
-                if not f.free < s < f.inside:
-                    s = (f.free + f.inside) / 2.0
-                f.s = min(s, ends[i])
-            q = self._posture(q_target, fingers)
-            self._measure(q, fingers, moving)
+                goal = gaps[i] - (0.0 if self._round[i] else sum(CLOSE) / 2.0)
+                step = goal / fastest[i]  # cannot pass the first touch
+                if gaps[i] < NEAR and (gaps[i] > 0.0 or self._round[i]):
+                    near = self._nearest(i)
+                    if not self._round[i]:
+                        speed = near.normal @ robot.link_jacobian(q, i, near.link) @ ways[i]
+                    else:
+                        J = robot.jacobian(q) if J is None else J
+                        speed = near.normal @ (J[3 * i : 3 * i + 3] @ ways[i])
+                    closing_speed = -float(speed)
+                    if closing_speed > 0.05 * fastest[i]:
+                        step = goal / closing_speed
+                ahead = s[i] + step
+                if not free[i] < ahead < inside[i]:
+                    ahead = (free[i] + inside[i]) / 2.0
+                s[i] = min(ahead, ends[i])
+            place(s, moving)
+            for i in moving:
+                gaps[i] = self._gap(i)
+                if gaps[i] < 0.0:
+                    inside[i] = min(inside[i], s[i])
+                else:
+                    free[i] = max(free[i], s[i])
         return self._missed(Miss.NO_TOUCH, moving[0])
 
-    def _aimed(
-        self, q: np.ndarray, ways: list[np.ndarray], which: Iterable[int]
-    ) -> list[np.ndarray] | None:
-        """The ways that change these fingers least, w = −(nᵀJ_γ)⁺, or None where `ways` are."""
+    def _aimed(self, q: np.ndarray, ways: np.ndarray, which: Iterable[int]) -> np.ndarray:
+        """The ways that change these fingers least, w = −(nᵀJ_γ)⁺; those of the others."""
         robot = self.scene.articulated
-        aimed = list(ways)
+        aimed = ways.copy()
         for i in which:
             gamma = list(robot.flexion[i])
             near = self._nearest(i)
             if len(gamma) == 1 or near.gap >= FAR:
                 continue
-            way = -(near.normal @ self._jacobian(q, i, near.link)[:, gamma])
+            way = -(near.normal @ robot.link_jacobian(q, i, near.link)[:, gamma])
             if np.abs(way).max() > 0.0:
-                aimed[i] = np.zeros_like(ways[i])
-                aimed[i][gamma] = way / np.abs(way).max()
-        same = all(np.array_equal(way, other) for way, other in zip(ways, aimed, strict=True))
-        return None if same else aimed
+                aimed[i, gamma] = way / np.abs(way).max()
+        return aimed
 
     def _touches(self, i: int, gap: float) -> bool:
         return abs(gap) <= TOUCH if self._round[i] else CLOSE[0] <= gap <= CLOSE[1]
 
-    def _posture(self, q_target: np.ndarray, fingers: list[_Finger]) -> np.ndarray:
-        robot = self.scene.articulated
-        q = q_target.copy()
-        for f in fingers:
-            moving = f.way != 0.0
-            moved = q_target[moving] + f.s * f.way[moving]
-            q[moving] = np.clip(moved, robot.q_lower[moving], robot.q_upper[moving])
-        robot.place(self._data, q)
-        return q
-
-    def _end(self, q_target: np.ndarray, way: np.ndarray) -> float:
-        """−s at which the last joint of a finger reaches its range, going `way`."""
-        robot = self.scene.articulated
-        moving = way != 0.0
-        room = np.where(way > 0.0, robot.q_upper - q_target, robot.q_lower - q_target)[moving]
-        return -min(ALL_THE_WAY, float((room / way[moving]).max()))
-
-    def _measure(self, q: np.ndarray, fingers: list[_Finger], which: Iterable[int]) -> None:
-        for i in which:
-            f = fingers[i]
-            f.gap = min(self._distance(g, REACH) for g in self.scene.articulated.geoms[i])
-            if f.gap < 0.0:
-                f.inside = min(f.inside, f.s)
-            else:
-                f.free = max(f.free, f.s)
-
-    def _closing_speed(self, q: np.ndarray, i: int, way: np.ndarray) -> float:
-        """[m/rad] at which the gap of contact point i shrinks."""
-        near = self._nearest(i)
-        return -float(near.normal @ self._jacobian(q, i, near.link) @ way)
-
-    def _jacobian(self, q: np.ndarray, i: int, x: np.ndarray) -> np.ndarray:
-        """∂x/∂q (3, n) [m/rad] of a point of link i that is at x (3,) [m], world."""
-        robot = self.scene.articulated
-        points = np.zeros((len(robot.geoms), 3))
-        points[i] = robot.on_link(q, i, x)
-        return robot.jacobian(q, points)[3 * i : 3 * i + 3]
+    def _gap(self, i: int) -> float:
+        geoms = self.scene.articulated.geoms[i]
+        if len(geoms) == 1:
+            return self._distance(geoms[0], REACH)
+        return min(self._distance(g, REACH) for g in geoms)
 
     def _missed(self, reason: Miss, i: int) -> Missed:
         return Missed(reason, self.scene.articulated.description.contact_points[i].name)
@@ -251,12 +232,13 @@ class GeometricProbe:
     def _nearest(self, i: int) -> _Near:
         """Where contact point i is nearest to the object."""
         model, data = self.scene.model, self._data
-        found = []
-        for geom in self.scene.articulated.geoms[i]:
+        gap, geom, link, thing = np.inf, -1, np.zeros(3), np.zeros(3)
+        for one in self.scene.articulated.geoms[i]:
             ends = np.zeros(6)
-            found.append((self._distance(geom, ANYWHERE, ends), geom, ends[:3], ends[3:]))
-        gap, geom, link, thing = min(found, key=lambda near: near[0])
-        kind, radius = model.geom_type[geom], 0.0
+            distance = self._distance(one, ANYWHERE, ends)
+            if distance < gap:
+                gap, geom, link, thing = distance, one, ends[:3], ends[3:]
+        kind = model.geom_type[geom]
         if kind in (SPHERE, CAPSULE):
             # At zero gap the nearest points coincide and give no direction; the centre does.
             centre, radius = data.geom_xpos[geom], float(model.geom_size[geom, 0])
@@ -264,7 +246,7 @@ class GeometricProbe:
                 axis, half = data.geom_xmat[geom].reshape(3, 3)[:, 2], model.geom_size[geom, 1]
                 centre = centre + np.clip((thing - centre) @ axis, -half, half) * axis
             away = centre - thing
-            normal = away / np.linalg.norm(away)
+            normal = away / math.sqrt(away @ away)
             return _Near(gap, centre - radius * normal, normal, radius)
         away = (link - thing) * (1.0 if gap > 0.0 else -1.0)
         return _Near(gap, link, away / np.linalg.norm(away), 0.0)
@@ -304,6 +286,14 @@ class GeometricProbe:
             place, radius = (near.link, near.radius) if ball else self._patch(i, near)
             contacts.append(Contact(place, near.normal, tip_radius=radius))
         return robot.grasp(q, contacts, others)
+
+
+def _way_left(joints: list[tuple[int, float, float, float, float]], sign: float) -> float:
+    """s [rad] at which the last of a finger's joints reaches its range, as s grows or falls."""
+    far = (
+        ((high if sign * speed > 0.0 else low) - at) / speed for _, at, low, high, speed in joints
+    )
+    return sign * min(ALL_THE_WAY, max(sign * s for s in far))
 
 
 def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:

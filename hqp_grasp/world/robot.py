@@ -63,6 +63,7 @@ class Robot:
     reach: np.ndarray = field(init=False)  # (k, n) [m/rad] no point of a link moves faster
     _points: np.ndarray = field(init=False, repr=False)  # (k, 3) [m] centres, link frames
     _bodies: np.ndarray = field(init=False, repr=False)  # (k,) links
+    _balls: np.ndarray | None = field(init=False, repr=False)  # (k,) geoms where all are balls
     _palm: tuple[int, np.ndarray, np.ndarray] = field(init=False, repr=False)  # body, p, R
     _hinge: np.ndarray = field(init=False, repr=False)  # (N,) bool
     _ancestor: np.ndarray = field(init=False, repr=False)  # (k, N) bool: joint j moves point i
@@ -103,6 +104,8 @@ class Robot:
         put("_bodies", np.array([link.body for link in links]))
         put("geoms", tuple(link.geoms for link in links))
         put("_points", np.array([link.centre for link in links]))
+        balls = all(link.radius > 0.0 for link in links)
+        put("_balls", np.array([link.geoms[0] for link in links]) if balls else None)
         put("tip_radius", np.array([link.radius for link in links]))
         chains = [_chain(model, link.body) for link in links]
         put("_ancestor", np.array([np.isin(np.arange(model.njnt), c) for c in chains]))
@@ -330,7 +333,10 @@ class Robot:
         return J * self._ancestor[:, :, None]
 
     def _world(self, data: mujoco.MjData, points: np.ndarray | None) -> np.ndarray:
-        points = self._points if points is None else points
+        if points is None:
+            if self._balls is not None:
+                return data.geom_xpos[self._balls]
+            points = self._points
         R = data.xmat[self._bodies].reshape(-1, 3, 3)
         return data.xpos[self._bodies] + (R @ points[:, :, None])[:, :, 0]
 
@@ -348,6 +354,13 @@ class Robot:
         """A place x (3,) [m], world, in the frame of contact point i's link."""
         data, body = self._at(q), self._bodies[i]
         return data.xmat[body].reshape(3, 3).T @ (x - data.xpos[body])
+
+    def link_jacobian(self, q: np.ndarray, i: int, x: np.ndarray) -> np.ndarray:
+        """∂x/∂q (3, n) [m/rad] of a point of link i that is at x (3,) [m], world."""
+        data = self._at(q)
+        axes = data.xaxis
+        J = np.where(self._hinge[:, None], _cross(axes, x - data.xanchor), axes)
+        return (J * self._ancestor[i][:, None]).T @ self.coupling
 
     def palm(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the palm is, p_palm (3,) [m] and R_world_palm (3, 3), world.
@@ -581,6 +594,7 @@ def _reach(model: mujoco.MjModel, link: _Link) -> np.ndarray:
     bound = np.zeros(model.njnt)
     places = [np.linalg.norm(_in_body(model, g, link.body)) for g in link.geoms]
     far = float(np.max(np.array(places) + model.geom_rbound[list(link.geoms)]))
+    far -= link.radius  # a ball's surface moves as its centre does
     body = link.body
     while body > 0:
         first = model.body_jntadr[body]
