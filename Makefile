@@ -98,6 +98,7 @@ results: $(READY_BENCH)
 	$(PY) -m hqp_grasp report $(RESULTS)/cylinder $(RESULTS)/cylinder-* > $(RESULTS)/report-cylinder.txt
 	$(PY) -m hqp_grasp report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
 	cp $(RESULTS)/cylinder/convergence.png docs/images/cylinder-convergence.png
+	$(call keep,cylinder-physical,scenarios/cylinder.py --probe physical --preset loadcell --out $(RESULTS)/cylinder-physical)
 	$(call keep,prisms,benchmarks/prisms.py --seed 0)
 	$(call keep,probing,benchmarks/probing.py)
 	$(call keep,limits,benchmarks/limits.py)

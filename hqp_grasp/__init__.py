@@ -37,9 +37,13 @@ from hqp_grasp.tasks import (
     Task,
     stack_of,
 )
+from hqp_grasp.touch.driver import Driver, DriverLimits, Readings
 from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.touch.imperfections import Imperfections
+from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.touch.sensing import sense
+from hqp_grasp.touch.simulated import Physics, SimulatedHand
 from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.objects import Body, Cylinder, Prism
 from hqp_grasp.world.robot import Robot
@@ -55,11 +59,14 @@ __all__ = [
     "ContactTask",
     "Controller",
     "Cylinder",
+    "Driver",
+    "DriverLimits",
     "ForceTask",
     "GeometricProbe",
     "Grasp",
     "HierarchyForm",
     "HqpGraspError",
+    "Imperfections",
     "InputError",
     "KinematicTask",
     "Level",
@@ -71,17 +78,21 @@ __all__ = [
     "ModelError",
     "MomentTask",
     "PaperForm",
+    "PhysicalProbe",
+    "Physics",
     "PostureTask",
     "Priority",
     "Prism",
     "Probe",
     "Projection",
     "ReachError",
+    "Readings",
     "Record",
     "ResultsError",
     "Robot",
     "RobotDescription",
     "Scene",
+    "SimulatedHand",
     "SingularTaskError",
     "Solution",
     "SolverError",

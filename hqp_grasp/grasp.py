@@ -166,6 +166,11 @@ class Miss(Enum):
     NO_TOUCH = "a finger closed without touching"
     INSIDE = "a fingertip began inside the object"
     OTHER_LINK = "another link touches the object"
+    BLOCKED = "the hand stopped itself on the way"
+    OWN_LINK = "a finger closed onto the hand itself"
+    LOST = "a contact was lost while the hand held"
+    UNCLEAR = "what a fingertip feels is no push on it"
+    SENSOR = "a fingertip's sensor does not answer"
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ SHOWN_ON = [
     "objects.md",
     "own-hand.md",
     "quickstart.md",
+    "real-hand.md",
     "solver.md",
 ]
 

@@ -13,6 +13,7 @@ from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.tasks.stack import Stack
+from hqp_grasp.touch.simulated import Truth
 from hqp_grasp.world.robot import Robot
 
 CONVERGED_FORCE = 1e-3  # [N²]
@@ -35,6 +36,12 @@ COLUMNS = {
     "hqp_projection_gap": "rad: largest difference of hierarchy and projection, limits inactive",
     "solve_us": "us: solving the hierarchy",
     "method": "the way the solver found the step",
+}
+# What is, beside what is felt: a physical probe's further columns.
+TRUE_COLUMNS = {
+    "eps_f_true": "N^2: as eps_f, of the contacts as they are; null where a tip is not in contact",
+    "eps_m_true": "(N m)^2: as eps_m, of the contacts as they are",
+    "object_moved": "m: the object's middle, since the first touch began",
 }
 # The columns that say the same in every row of a trial.
 TRIAL_COLUMNS = {
@@ -142,8 +149,8 @@ class Record:
 
 def meaning(column: str) -> str:
     """Unit and meaning of a column that a probe fills."""
-    if column in COLUMNS:
-        return COLUMNS[column]
+    if column in COLUMNS | TRUE_COLUMNS:
+        return (COLUMNS | TRUE_COLUMNS)[column]
     head, _, rest = column.partition("_")
     if head == "q":
         return JOINT_COLUMN
@@ -213,6 +220,19 @@ def felt_row(
     return row | {f"q_{joint}": float(q) for joint, q in zip(robot.joints, grasp.q, strict=True)}
 
 
+def true_columns(truth: Truth | None) -> dict[str, object]:
+    """TRUE_COLUMNS, and the links in the object as they are; None where nothing is known."""
+    if truth is None:
+        return dict.fromkeys(TRUE_COLUMNS)
+    grasp = truth.grasp
+    return {
+        "eps_f_true": None if grasp is None else ForceTask().potential(grasp),
+        "eps_m_true": None if grasp is None else MomentTask().potential(grasp),
+        "object_moved": truth.moved,
+        "other_links": ", ".join(truth.other_links),
+    }
+
+
 def law_columns(stack: Stack, grasp: Grasp | None, solution: Solution | None) -> dict[str, object]:
     """LAW_COLUMNS of each law: its error at `grasp`, its level in the step that led there.
 
@@ -254,6 +274,8 @@ def _verdict(rows: list[dict[str, Any]], force: str, moment: str) -> str:
         return "error"
     if not last["in_contact"]:
         return "lost"
+    if last[force] is None:  # a tip does not touch the object, whatever was felt
+        return "not balanced"
     if not (last[force] <= CONVERGED_FORCE and last[moment] <= CONVERGED_MOMENT**2):
         return "not balanced"
     if any(row["other_links"] for row in rows if row["probe"] > 0):

@@ -63,6 +63,10 @@ class Settings:
     """Longest step of a contact along an axis [m]."""
     landing: bool = True
     """Correct each step by the hand's own kinematics before it touches."""
+    probe: Literal["geometric", "physical"] = "geometric"
+    """geometric: exact distances. physical: a simulated hand, driven and felt as a real one."""
+    preset: Literal["loadcell"] | None = None
+    """Imperfections of the physical probe's hand; without, there are none."""
     links: Literal["block", "pass"] = "block"
     """Whether links other than the fingertips are stopped by the object, or pass through it, as in
     the paper."""
@@ -123,6 +127,8 @@ def trial_of(scene: Scene, settings: Settings) -> Trial:
         form=form_of(settings.form, settings.solver),
         landing=settings.landing,
         links=settings.links,
+        probe=settings.probe,
+        preset=settings.preset,
     )
 
 

@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import index
 
 import numpy as np
 
 from hqp_grasp.control.controller import Controller, Step
 from hqp_grasp.control.forms import Form
-from hqp_grasp.errors import InputError, one_of
-from hqp_grasp.experiments.record import Record, empty_row, felt_row, kind_and_message
+from hqp_grasp.errors import InputError, ReachError, one_of
+from hqp_grasp.experiments.record import (
+    Record,
+    empty_row,
+    felt_row,
+    kind_and_message,
+    true_columns,
+)
 from hqp_grasp.experiments.start import FirstTouch, Start
 from hqp_grasp.grasp import Grasp, Missed, Touch
+from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Stack, Task
 from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.touch.imperfections import Imperfections
+from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.probe import Probe
+from hqp_grasp.touch.simulated import Physics, SimulatedHand
+from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
+
+MAX_UNHELD = 20  # postures in a row that touch by geometry and not by force
+IMPERFECTIONS = 1  # their random numbers are a stream of their own: starts are those without
 
 
 @dataclass(frozen=True)
@@ -34,16 +48,32 @@ class Trial:
     form: str | Form = "hierarchy"
     landing: bool = True
     links: str = "block"  # or "pass": see GeometricProbe
+    probe: str | Physics = "geometric"  # or "physical", which is Physics()
+    preset: str | None = None  # of Imperfections, replacing those of `probe`
     start: Start | Grasp = field(default_factory=Start)
 
     def __post_init__(self) -> None:
         one_of("links", self.links, ("pass", "block"))
+        if not isinstance(self.probe, Physics):
+            one_of("probe", self.probe, ("geometric", "physical"))
+        if self.preset is not None:
+            imperfections = Imperfections.preset(self.preset)
+            if self.physics is None:
+                raise InputError(f"preset {self.preset!r} needs probe='physical'")
+            object.__setattr__(self, "probe", replace(self.physics, imperfections=imperfections))
         if self.probes < 1:
             raise InputError(f"a trial needs at least 1 probe; got {self.probes}")
         if not isinstance(self.start, Start | Grasp):
             raise InputError(f"Trial.start must be a Start or a Grasp; got {self.start!r}")
         object.__setattr__(self, "stack", Stack.of(self.stack))
         self.controller(self.scene, 0)  # raises for what it cannot compose
+
+    @property
+    def physics(self) -> Physics | None:
+        """The world of a physical probe, None for a geometric one."""
+        if isinstance(self.probe, Physics):
+            return self.probe
+        return Physics() if self.probe == "physical" else None
 
     def controller(self, scene: Scene, seed: int) -> Controller:
         """The controller of one trial, in the scene where it began."""
@@ -84,7 +114,7 @@ class Trial:
                     history.append(touch)
         except Exception as error:
             failure = error
-        rows += [empty_row(robot, stack) for _ in range(self.probes + 1 - len(rows))]
+        rows += [self._empty(robot, stack) for _ in range(self.probes + 1 - len(rows))]
         grasps = tuple(touch.felt for touch in history if isinstance(touch.felt, Grasp))
         ended = None if failure is None else kind_and_message(failure)
         record = Record(entropy, tuple(rows), grasps, rejected, robot.joints, ended)
@@ -95,7 +125,7 @@ class Trial:
             return FirstTouch(self.scene, self.start, 0)
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         if probe is None:
-            return self.start.draw(self.scene, lambda scene: GeometricProbe(scene, self.links), rng)
+            return self._drawn(self.start, entropy, rng)
         given = probe
 
         def same(scene: Scene) -> Probe:
@@ -108,6 +138,24 @@ class Trial:
 
         return self.start.draw(self.scene, same, rng)
 
+    def _drawn(
+        self, start: Start, entropy: tuple[int, ...], rng: np.random.Generator
+    ) -> FirstTouch:
+        """A start found by geometry; where a simulated hand cannot hold it, the next one."""
+        rejected, last = 0, ""
+        for _ in range(MAX_UNHELD):
+            began = start.draw(self.scene, lambda scene: GeometricProbe(scene, self.links), rng)
+            rejected += began.rejected
+            hand, touching = self._hand(began, entropy, None)
+            felt = began.grasp if hand is None else touching.touch(began.grasp.q)
+            if isinstance(felt, Grasp):
+                return FirstTouch(began.scene, began.grasp, rejected)
+            last, rejected = f"{felt.reason.value} ({felt.where})", rejected + 1
+        raise ReachError(
+            f"the simulated hand holds none of {MAX_UNHELD} postures that geometry finds "
+            f"(the last: {last})"
+        )
+
     def _probe(
         self, began: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
     ) -> Iterator[tuple[dict[str, object], Touch | None]]:
@@ -115,26 +163,60 @@ class Trial:
         robot = began.scene.articulated
         controller = self.controller(began.scene, entropy[-1])
         stack = Stack.of(self.stack)
-        touching = probe or GeometricProbe(began.scene, self.links)
-        history = [Touch(began.grasp.q, began.grasp)]
-        yield felt_row(robot, stack, began.grasp), history[0]
+        hand, touching = self._hand(began, entropy, probe)
+        felt: Grasp | Missed = began.grasp
+        if hand is not None:
+            felt = touching.touch(began.grasp.q)
+        history = [Touch(began.grasp.q, felt)]
+        yield self._row(robot, stack, history[0], None, hand), history[0]
         while len(history) <= self.probes:
             step = controller.step(history)
             if step.q_target is None:
-                yield empty_row(robot, stack) | {"outcome": f"gave up: {step.reason}"}, None
+                row = self._empty(robot, stack) | {"outcome": f"gave up: {step.reason}"}
+                yield row, None
                 return
-            felt = touching.touch(step.q_target)
-            history.append(Touch(step.q_target, felt))
-            worst = robot.violation(step.q_target)
-            if isinstance(felt, Missed):
-                row = empty_row(robot, stack, step.solution) | {
-                    "outcome": f"{felt.reason.value} ({felt.where})",
-                    "limit_violation": worst,
-                }
-            else:
-                row = felt_row(robot, stack, felt, step.solution)
-                row["limit_violation"] = max(worst, robot.violation(felt.q))
-            yield row | _about(step), history[-1]
+            history.append(Touch(step.q_target, touching.touch(step.q_target)))
+            yield (
+                self._row(robot, stack, history[-1], step.solution, hand) | _about(step),
+                history[-1],
+            )
+
+    def _hand(
+        self, began: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
+    ) -> tuple[SimulatedHand | None, Probe]:
+        """The simulated hand, if any, and the probe that touches."""
+        physics = self.physics
+        if probe is not None or physics is None:
+            return None, probe or GeometricProbe(began.scene, self.links)
+        rng = np.random.default_rng(np.random.SeedSequence([*entropy, IMPERFECTIONS]))
+        hand = SimulatedHand(began.scene, physics, self.links, rng)
+        hand.place(began.grasp.q)
+        return hand, PhysicalProbe(hand, began.scene.articulated)
+
+    def _empty(
+        self, robot: Robot, stack: Stack, solution: Solution | None = None
+    ) -> dict[str, object]:
+        row = empty_row(robot, stack, solution)
+        return row if self.physics is None else row | true_columns(None)
+
+    def _row(
+        self,
+        robot: Robot,
+        stack: Stack,
+        touch: Touch,
+        solution: Solution | None,
+        hand: SimulatedHand | None,
+    ) -> dict[str, object]:
+        felt, worst = touch.felt, robot.violation(touch.q_target)
+        row = self._empty(robot, stack, solution)
+        if isinstance(felt, Missed):
+            row |= {"outcome": f"{felt.reason.value} ({felt.where})", "limit_violation": worst}
+        else:
+            row |= felt_row(robot, stack, felt, solution)
+            row["limit_violation"] = max(worst, robot.violation(felt.q))
+        if hand is not None:
+            row |= true_columns(hand.truth())
+        return row
 
 
 def _about(step: Step) -> dict[str, object]:

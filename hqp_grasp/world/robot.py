@@ -362,6 +362,10 @@ class Robot:
         J = np.where(self._hinge[:, None], _cross(axes, x - data.xanchor), axes)
         return (J * self._ancestor[i][:, None]).T @ self.coupling
 
+    def tip_frames(self, q: np.ndarray) -> np.ndarray:
+        """R_world_tip of the contact points' sites (k, 3, 3), in which their sensors read."""
+        return self._at(q).site_xmat[self._sites].reshape(-1, 3, 3)
+
     def palm(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the palm is, p_palm (3,) [m] and R_world_palm (3, 3), world.
 

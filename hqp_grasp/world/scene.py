@@ -58,9 +58,8 @@ class Scene:
             raise InputError(f"Scene.base needs a unit quaternion (w, x, y, z); got {base[3:]}")
         object.__setattr__(self, "base", tuple(base.tolist()))
 
-    @cached_property
-    def model(self) -> mujoco.MjModel:
-        """Robot and object, compiled."""
+    def spec(self) -> mujoco.MjSpec:
+        """Robot and object, to be changed before they are compiled."""
         description: RobotDescription = self.__dict__["_description"]
         spec = description.spec()
         try:
@@ -69,9 +68,19 @@ class Scene:
                 root.set_frame(frame)
             body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
             self.object.add_geoms(spec, body)
-            return spec.compile()
         except ValueError as error:
             raise InputError(f"{description.xml.name} does not compile: {error}") from error
+        return spec
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """Robot and object, compiled."""
+        spec = self.spec()
+        try:
+            return spec.compile()
+        except ValueError as error:
+            name = self.__dict__["_description"].xml.name
+            raise InputError(f"{name} does not compile: {error}") from error
 
     @cached_property
     def articulated(self) -> Robot:

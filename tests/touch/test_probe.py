@@ -418,6 +418,11 @@ def test_every_reason_reads_as_one():
         "a finger closed without touching",
         "a fingertip began inside the object",
         "another link touches the object",
+        "the hand stopped itself on the way",
+        "a finger closed onto the hand itself",
+        "a contact was lost while the hand held",
+        "what a fingertip feels is no push on it",
+        "a fingertip's sensor does not answer",
     }
 
 

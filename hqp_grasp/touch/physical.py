@@ -1,0 +1,252 @@
+"""Touching by force: the probe that knows what a real hand knows, through its driver alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+
+from hqp_grasp.errors import InputError, positive
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
+from hqp_grasp.touch.driver import Driver, Readings
+from hqp_grasp.touch.geometric import RETREAT
+from hqp_grasp.touch.sensing import sense
+from hqp_grasp.world.robot import Robot
+
+GRAVITY = np.array([0.0, 0.0, -9.81])  # [m/s²] world
+OPENING = 0.3  # [s] at least, each ramp
+MOVING = 0.3
+RESTING = 0.1  # [s] before the tips are weighed
+WEIGHING = 0.1  # [s]
+SWIFT = 1.0  # [rad/s] of closing, far from the touch that is expected
+CAREFUL = 0.2  # [rad/s] near it
+SLOW = 0.3  # [rad/s] where nothing is known
+EXPECTED = 0.08  # [rad] before and after the expected touch closing is careful
+NOTICED = 0.1  # [N] that counts as touch
+POLL = 0.1  # [s] between looks at the fingers while they close
+PATIENCE = 3.0  # [s] that closing may take beyond what its range and speed need
+SETTLING, PRESSING = 0.3, 0.3  # [s], [s/N] that the held force may take: a finger may slide
+SETTLED = 0.04  # share of it that may be missing
+SENSING = 0.1  # [s] of readings that are averaged
+LOST = 0.5  # share of the held force below which a contact is none
+SPIKE = 0.5  # share of the held force by which a sample lies beside the others, to count as none
+STEEP = 1.5  # [–] tangential by normal force that no fingertip holds
+OWN = 2e-3  # [m] from a link of the robot, a tip touches that link
+CLOSED = 0.02  # [rad] from the end of its range a finger is closed
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicalProbe:
+    """Touch with a driven hand: open, move, close until felt, hold, and sense the wrenches.
+
+    It sees joint angles and fingertip wrenches, and the robot's kinematics, nothing else. Each
+    touch weighs the open tips in the air first: what is felt there, turned as the tips turn, is
+    not of the object. Contacts come from `sense`, with their wrenches; a touch of something that a
+    push on the tip cannot explain is a Missed.
+    """
+
+    driver: Driver
+    robot: Robot
+    force: float = 1.0  # [N] held while the contact is sensed
+    _payload: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)  # kg (k,), m (k, 3)
+    _data: mujoco.MjData = field(init=False, repr=False)
+    _own: tuple[tuple[int, list[int]], ...] = field(init=False, repr=False)  # tips, what they meet
+
+    def __post_init__(self) -> None:
+        positive("PhysicalProbe.force", self.force)
+        most = self.driver.limits.force
+        if self.force > most:
+            raise InputError(f"PhysicalProbe.force {self.force} N is above the driver's {most} N")
+        if len(self.driver.limits.lower) != self.robot.n:
+            raise InputError(
+                f"the driver moves {len(self.driver.limits.lower)} joints, {self.robot} has "
+                f"{self.robot.n}: is it of another robot?"
+            )
+        object.__setattr__(self, "_payload", payload(self.robot))
+        object.__setattr__(self, "_data", mujoco.MjData(self.robot.model))
+        object.__setattr__(self, "_own", _own_links(self.robot))
+
+    def touch(self, q_target: np.ndarray) -> Grasp | Missed:
+        """Move to q_target (n,) [rad], close every finger, and return the grasp felt there."""
+        robot, driver, limits = self.robot, self.driver, self.driver.limits
+        target = robot.require_q("q_target", q_target)
+        flexion = np.array([j for (j,) in robot.flexion])
+        opened = np.clip(driver.wait(0.0).q[-1], limits.lower, limits.upper)
+        opened[flexion] = np.maximum(limits.lower[flexion], opened[flexion] - RETREAT)
+        away = target.copy()
+        away[flexion] = np.maximum(limits.lower[flexion], away[flexion] - RETREAT)
+        for q, duration in ((opened, OPENING), (away, MOVING)):
+            fault = self._go(q, duration)
+            if fault:
+                return Missed(Miss.BLOCKED, fault)
+        driver.wait(RESTING)
+        free = driver.wait(WEIGHING)
+        missed = self._close(target[flexion], flexion)
+        if missed is not None:
+            return missed
+        driver.hold(self.force)
+        return self._sense(free, self._settle(free))
+
+    def _settle(self, free: Readings) -> Readings:
+        """Readings under the held force, once it is what was asked for.
+
+        A finger that slides never is: then those of when the least pressed one pressed most.
+        """
+        left, weighed = SETTLING + PRESSING * self.force, self._steady(free)[:, :3]
+        best, most = None, -1.0
+        while best is None or left > 0.0:
+            held = self.driver.wait(SENSING)
+            left -= SENSING
+            pressed = np.linalg.norm(self._steady(held)[:, :3] - weighed, axis=1)
+            if (np.abs(pressed - self.force) <= SETTLED * self.force).all() or held.fault:
+                return held
+            if pressed.min() > most:
+                best, most = held, float(pressed.min())
+        return best
+
+    def _go(self, q: np.ndarray, duration: float) -> str:
+        """Move there; return what stopped the hand on its way, empty if nothing did."""
+        left = self.driver.move(q, duration)
+        while left > 0.0:
+            slice_ = min(left, 0.5 * self.driver.limits.watchdog)
+            fault = self.driver.wait(slice_).fault
+            if fault:
+                return fault
+            left -= slice_
+        return ""
+
+    def _close(self, expected: np.ndarray, flexion: np.ndarray) -> Missed | None:
+        """Close all fingers; None once all have touched."""
+        driver, limits = self.driver, self.driver.limits
+        names = [point.name for point in self.robot.description.contact_points]
+        readings = driver.wait(0.0)
+        way = np.maximum(expected - EXPECTED - readings.q[-1][flexion], 0.0)
+        swift = float(way.max()) / SWIFT
+        if swift > 0.0:
+            for i, length in enumerate(way):
+                if length > 0.0:
+                    driver.close(i, length / swift, NOTICED)
+            readings = self._watch(driver, swift)
+        careful = 2.0 * EXPECTED / CAREFUL
+        speed = CAREFUL
+        for i in np.flatnonzero(~readings.touched).tolist():
+            driver.close(i, speed, NOTICED)
+        left = PATIENCE + float((limits.upper[flexion] - readings.q[-1][flexion]).max()) / SLOW
+        while not readings.fault and not readings.touched.all():
+            if readings.stalled.any():
+                driver.stop()
+                i = int(np.argmax(readings.stalled))
+                silent = _silent(readings)[i]
+                return Missed(Miss.SENSOR if silent else Miss.OTHER_LINK, names[i])
+            closed = readings.q[-1][flexion] >= limits.upper[flexion] - CLOSED
+            closed |= left <= 0.0  # a finger that takes longer than its range does not close
+            if (closed & ~readings.touched).any():
+                driver.stop()
+                return Missed(Miss.NO_TOUCH, names[int(np.argmax(closed & ~readings.touched))])
+            if careful <= 0.0 and speed == CAREFUL:
+                speed = SLOW
+                for i in np.flatnonzero(~readings.touched).tolist():
+                    driver.close(i, speed, NOTICED)
+            readings = driver.wait(POLL)
+            careful, left = careful - POLL, left - POLL
+        return Missed(Miss.BLOCKED, readings.fault) if readings.fault else None
+
+    @staticmethod
+    def _watch(driver: Driver, duration: float) -> Readings:
+        """Wait, in slices that the watchdog allows, while nothing stops the hand."""
+        while True:
+            slice_ = min(duration, 0.5 * driver.limits.watchdog)
+            readings = driver.wait(slice_)
+            duration -= slice_
+            if duration <= 0.0 or readings.fault or readings.stalled.any():
+                return readings
+
+    def _sense(self, free: Readings, held: Readings) -> Grasp | Missed:
+        robot = self.robot
+        names = [point.name for point in robot.description.contact_points]
+        if held.fault:
+            return Missed(Miss.BLOCKED, held.fault)
+        silent = _silent(held)
+        if silent.any() and not silent.all():
+            return Missed(Miss.SENSOR, names[int(silent.argmax())])
+        q = np.clip(held.q.mean(axis=0), robot.q_lower, robot.q_upper)
+        robot.place(self._data, q)
+        for (tip, links), name in zip(self._own, names, strict=True):
+            for link in links:
+                gap = mujoco.mj_geomDistance(robot.model, self._data, tip, link, 2.0 * OWN, None)
+                if gap < OWN:
+                    return Missed(Miss.OWN_LINK, name)
+        R_world_tip = robot.tip_frames(q).copy()
+        wrench = self._steady(held) - self._steady(free)
+        wrench -= weight(self._payload, R_world_tip)
+        wrench += weight(self._payload, robot.tip_frames(free.q.mean(axis=0)))
+        contacts = []
+        for i, (R, center, radius) in enumerate(
+            zip(R_world_tip, robot.centers(q), robot.tip_radius, strict=True)
+        ):
+            pressed = float(np.linalg.norm(wrench[i, :3]))
+            if pressed < LOST * self.force:
+                return Missed(Miss.LOST, names[i])
+            position, normal = sense(wrench[i], float(radius))
+            upright = min(1.0, float(wrench[i, :3] @ normal) / pressed)
+            if np.hypot(1.0, STEEP) * upright < 1.0:
+                return Missed(Miss.UNCLEAR, names[i])
+            n = R @ normal
+            world = np.concatenate([R @ wrench[i, :3], R @ wrench[i, 3:]])
+            contacts.append(Contact(center + R @ position, n, wrench=world, confidence=upright))
+        return robot.grasp(q, contacts)
+
+    def _steady(self, readings: Readings) -> np.ndarray:
+        """The wrenches (k, 6), averaged over all samples but spikes."""
+        force = readings.wrench[..., :3]
+        beside = np.linalg.norm(force - np.median(force, axis=0), axis=-1)  # (t, k)
+        kept = beside <= np.maximum(SPIKE * self.force, np.median(beside, axis=0))
+        return (readings.wrench * kept[..., None]).sum(axis=0) / kept.sum(axis=0)[:, None]
+
+
+def _silent(readings: Readings) -> np.ndarray:
+    """Tips (k,) that say the same to the last bit in three samples running, as none in use does."""
+    same = (np.diff(readings.wrench, axis=0) == 0.0).all(axis=2)
+    return (same[1:] & same[:-1]).any(axis=0)
+
+
+def _own_links(robot: Robot) -> tuple[tuple[int, list[int]], ...]:
+    """Each tip's geom, and those of the robot that it can meet: all but its own finger's links."""
+    model = robot.model
+    tips = [model.geom(point.geom).id for point in robot.description.contact_points]
+    arm = int(model.site(robot.description.palm).bodyid[0])
+    moving = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] != 0]
+    touching = [g for g in moving if model.geom_contype[g] or model.geom_conaffinity[g]]
+    found = []
+    for tip in tips:
+        finger, body = set(), int(model.geom_bodyid[tip])
+        while body not in (0, arm):
+            finger.add(body)
+            body = int(model.body_parentid[body])
+        found.append((tip, [g for g in touching if model.geom_bodyid[g] not in finger]))
+    return tuple(found)
+
+
+def payload(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """What hangs on each tip's sensor: mass (k,) [kg], and its middle from the tip's centre (k, 3).
+
+    The middle is in the tip's frame [m].
+    """
+    model = robot.model
+    masses, middles = [], []
+    for point in robot.description.contact_points:
+        site = model.site(point.site)
+        body = int(site.bodyid[0])
+        masses.append(float(model.body_mass[body]))
+        R = np.zeros(9)
+        mujoco.mju_quat2Mat(R, site.quat)
+        middles.append(R.reshape(3, 3).T @ (model.body_ipos[body] - site.pos))
+    return np.array(masses), np.array(middles)
+
+
+def weight(load: tuple[np.ndarray, np.ndarray], R_world_tip: np.ndarray) -> np.ndarray:
+    """Gravity's wrench (k, 6) on each tip about its centre, in its frame."""
+    masses, middles = load
+    force = masses[:, None] * (GRAVITY @ R_world_tip)
+    return np.concatenate([force, np.cross(middles, force)], axis=1)

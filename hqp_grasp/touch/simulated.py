@@ -1,0 +1,642 @@
+"""A driver whose hand is simulated: MuJoCo's full dynamics behind the door of a real one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+
+from hqp_grasp.errors import InputError, ModelError, one_of, positive
+from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.touch.driver import DriverLimits, Readings
+from hqp_grasp.touch.geometric import OVERLAP, RETREAT
+from hqp_grasp.touch.imperfections import Imperfections, SensorErrors
+from hqp_grasp.world.objects import OBJECT
+from hqp_grasp.world.scene import Scene
+
+# How a contact yields: solref and solimp of the object's geom.
+CONTACTS = {
+    "stiff": ((0.005, 1.0), (0.99, 0.999, 0.001, 0.5, 2.0)),
+    "medium": ((0.01, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)),
+    "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),  # MuJoCo's
+}
+SUPPORTS = ("fixed", "pedestal", "table")
+SPIN_FRICTION = 0.02  # [m] torque about the normal that a contact transmits, by normal force
+SAMPLING = 0.01  # [s] between readings
+PEAK = 1.875  # a minimum-jerk ramp's fastest speed, by its mean
+SPEED_SHARE = 0.8  # of a joint's speed limit that a move is planned with
+CLOSING_ACCELERATION = 20.0  # [rad/s²]
+STALL = 0.015  # [rad] a closing joint stays behind its target by, beyond the servo's own lag
+FOLLOWING = 0.05  # [rad] beside its target at which a joint is held by something: the hand stops
+FORCE_RATE = 5.0  # [N/s] by which the held force follows what is asked
+FORCE_GAIN = 0.5  # share of the force's error that one cycle of holding takes away
+HOLDING_SPEED = 0.3  # [rad/s] that holding corrects by, at most
+LEAD = 2.0  # times the servo's give at the held force, by which a target leads its joint at most
+GUARD = 0.6  # share of the force limit at which the driver stops
+PRESS = 0.4  # share of the force limit that is held, at most
+MOVING_STEPS, CLOSING_STEPS, HOLDING_STEPS = 200, 25, 20  # in one call of the simulator
+IDLE, CLOSING, HOLDING = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Physics:
+    """The world in which a simulated hand touches.
+
+    `contact` says how the object yields, one of CONTACTS. `support` holds it: "fixed"; free on a
+    "pedestal" narrower than itself; free on a "table".
+    """
+
+    contact: str = "medium"
+    support: str = "fixed"
+    mass: float = 0.1  # [kg] of a free object
+    friction: float = 0.6  # of the object
+    timestep: float = 0.002  # [s]
+    imperfections: Imperfections = field(default_factory=Imperfections)
+
+    def __post_init__(self) -> None:
+        one_of("contact", self.contact, CONTACTS)
+        one_of("support", self.support, SUPPORTS)
+        for name in ("mass", "friction", "timestep"):
+            positive(f"Physics.{name}", getattr(self, name))
+        if not isinstance(self.imperfections, Imperfections):
+            raise InputError(
+                "Physics.imperfections must be Imperfections, such as "
+                f'Imperfections.preset("loadcell"); got {self.imperfections!r}'
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is, as only a simulation knows."""
+
+    grasp: Grasp | None  # the true contacts; None unless every tip touches the object
+    forces: np.ndarray  # (k, 3) [N] that the object applies to each tip, world
+    R_world_tip: np.ndarray  # (k, 3, 3) where the tips really point
+    moved: float  # [m] the object's middle, since the hand was placed
+    turned: float  # [rad] the object
+    other_links: tuple[str, ...]  # geoms beside the tips that touch the object
+    table_tips: tuple[str, ...]  # tips that touch what the object stands on
+
+
+class SimulatedHand:
+    """`Driver` of a robot's position servos in a scene, in MuJoCo's full dynamics.
+
+    With links="pass" only tips meet the object. `rng` draws the imperfections.
+
+    Phases run in single calls of the simulator, whose readings are searched afterwards: where
+    something happened, the simulation returns to that step and goes on from there. So the loop
+    reacts at every step, and no Python runs in between.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        physics: Physics | None = None,
+        links: str = "block",
+        rng: np.random.Generator | None = None,
+        force_limit: float = 15.0,  # [N] as the BarrettHand presses
+        watchdog: float = 1.0,  # [s]
+    ) -> None:
+        one_of("links", links, ("pass", "block"))
+        physics = physics or Physics()
+        about, timestep = physics.imperfections, physics.timestep
+        self.robot = scene.articulated
+        k, n = len(self.robot.flexion), self.robot.n
+        self._flexion = np.array([_only(point) for point in self.robot.flexion])
+        self._free = physics.support != "fixed"
+        self.model = _model(scene, physics, links)
+        self._data = mujoco.MjData(self.model)
+        self._rollout = Rollout(nthread=0)
+        self._dt = timestep
+        self._every = max(1, round(SAMPLING / timestep))
+        model, robot = self.model, self.robot
+        names = [robot.model.joint(j).name for j in range(robot.model.njnt)]
+        self._all = np.array([model.joint(j).qposadr[0] for j in names])
+        self._q = np.array([model.joint(j).qposadr[0] for j in robot.joints])
+        self._v = np.array([model.joint(j).dofadr[0] for j in robot.joints])
+        self._servo = _servos(model, robot.joints)
+        self._kp = model.actuator_gainprm[self._servo, 0]
+        lag = -model.actuator_biasprm[self._servo, 2] / self._kp
+        self._lag = lag  # [s] a servo stays behind its target, by speed
+        points = robot.description.contact_points
+        self._tips = [model.geom(p.geom).id for p in points]
+        self._sites = [model.site(p.site).id for p in points]
+        collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        thing = model.geom_bodyid == model.body(OBJECT).id
+        self._objects = {int(g) for g in np.flatnonzero(thing & collides)}
+        fixed = (0, model.body(OBJECT).id)
+        self._hand = {g for g in range(model.ngeom) if model.geom_bodyid[g] not in fixed}
+        self._passing = [
+            g for g in sorted(self._hand - set(self._tips)) if links == "pass" and collides[g]
+        ]
+        first = model.sensor(f"{points[0].name} touch force").adr[0]
+        self._wrench = slice(first, first + 6 * k)
+        first = model.sensor(f"{robot.joints[0]} torque").adr[0]
+        self._torque = slice(first, first + n)
+        torque = model.actuator_forcerange[self._servo, 1]
+        self.limits = DriverLimits(
+            robot.q_lower, robot.q_upper, robot.velocity, torque, force_limit, watchdog
+        )
+        self.rate = 1.0 / (self._every * timestep)
+        self._rng = rng or np.random.default_rng(0)
+        self._errors = SensorErrors(
+            about, k, np.isin(robot.joints, robot.description.arm), self._rng
+        )
+        self._late = round(about.latency / timestep)
+        self.simulated = 0  # steps in all
+        # The largest of each since the hand was made, at any step.
+        self.worst = {"range [rad]": 0.0, "speed share": 0.0, "torque share": 0.0, "force [N]": 0.0}
+        self.place(robot.home)
+
+    # ------------------------------------------------------------ what only a simulation can
+
+    def place(self, q: np.ndarray) -> None:
+        """Put the hand at q (n,) [rad], at rest, its flexions opened, and the object in its place.
+
+        They open by RETREAT, or as far as they go where that leaves the hand in the object. Raises
+        InputError where it is in the object all the same.
+        """
+        robot, model, data = self.robot, self.model, self._data
+        q = robot.require_q("SimulatedHand.place: q", q).copy()
+        q[self._flexion] = np.maximum(self.limits.lower[self._flexion], q[self._flexion] - RETREAT)
+        if self._put(q):
+            q[self._flexion] = self.limits.lower[self._flexion]
+            inside = self._put(q)
+            if inside:
+                raise InputError(
+                    f"SimulatedHand.place: {inside} is in the object, with open fingers; "
+                    "begin further away from it"
+                )
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        self._state = np.zeros(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, data, self._state, kind)
+        self._warm = np.zeros(model.nv)
+        self._goal = q.copy()  # (n,) [rad] the commanded posture, as encoders have it
+        self._play = q.copy()  # (n,) [rad] what the joints are told of it
+        self._ramp: tuple[np.ndarray, np.ndarray, int, int] | None = None  # from, to, step, steps
+        k = len(self._tips)
+        self._mode = [IDLE] * k
+        self._speed = [0.0] * k  # [rad/s] asked
+        self._now = [0.0] * k  # [rad/s] of the closing target
+        self._force = [0.0] * k  # [N] that ends closing, or is held
+        self._aim = [0.0] * k  # [N] that holding follows now
+        self._give = [0.0] * k  # [rad/N] of the servo at the tip
+        self._zero = np.zeros((k, 3))  # [N] at the call of `close`
+        self._touched, self._stalled = np.zeros(k, bool), np.zeros(k, bool)
+        self._fault = ""
+        still = -data.sensordata[self._wrench].reshape(1, k, 6)
+        self._tail = np.repeat(still, self._late, axis=0)
+        self._last = self._errors.wrench(np.zeros(1), still)  # the newest samples
+
+    def _put(self, q: np.ndarray) -> str:
+        """Put hand and object in their places; return the hand's geom that is in the object."""
+        robot, model, data = self.robot, self.model, self._data
+        mujoco.mj_resetData(model, data)
+        data.qpos[self._all] = robot.coupling @ q + robot.offset
+        data.ctrl[self._servo] = q
+        mujoco.mj_forward(model, data)
+        for contact in data.contact[: data.ncon]:
+            one, other = contact.geom.tolist()
+            touching = other if one in self._objects else one
+            felt = self._objects & {one, other} and touching in self._hand
+            if felt and contact.dist < 0.0:
+                return model.geom(touching).name
+        return ""
+
+    def truth(self) -> Truth:
+        """What is, now."""
+        model, data = self.model, self._data
+        mujoco.mj_setState(model, data, self._state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_forward(model, data)
+        k = len(self._tips)
+        normals: list[np.ndarray | None] = [None] * k
+        pressed, forces = [0.0] * k, np.zeros((k, 3))
+        links, table = [], []
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            one, other = contact.geom.tolist()
+            if self._objects & {one, other}:
+                touching = other if one in self._objects else one
+                wrench = np.zeros(6)
+                mujoco.mj_contactForce(model, data, i, wrench)
+                if touching in self._tips:
+                    at = self._tips.index(touching)
+                    frame = contact.frame.reshape(3, 3) * (1.0 if one in self._objects else -1.0)
+                    forces[at] += frame.T @ wrench[:3]
+                    if wrench[0] > pressed[at]:
+                        pressed[at] = wrench[0]
+                        normals[at] = frame[0] / np.linalg.norm(frame[0])
+                elif touching in self._hand:
+                    links.append(model.geom(touching).name)
+            else:
+                table += [
+                    model.geom(tip).name
+                    for tip, ground in ((one, other), (other, one))
+                    if tip in self._tips and model.geom(ground).name == "support"
+                ]
+        for g in self._passing:
+            if any(
+                mujoco.mj_geomDistance(model, data, g, thing, 0.0, None) < -OVERLAP
+                for thing in self._objects
+            ):
+                links.append(model.geom(g).name)
+        grasp = None
+        centers = data.site_xpos[self._sites]
+        if all(normal is not None for normal in normals):
+            contacts = [
+                Contact(c - r * v, v)
+                for c, r, v in zip(centers, self.robot.tip_radius, normals, strict=True)
+                if v is not None
+            ]
+            grasp = self.robot.grasp(data.qpos[self._q], contacts, tuple(dict.fromkeys(links)))
+        moved = turned = 0.0
+        if self._free:
+            pose = data.joint(OBJECT).qpos
+            start = model.qpos0[model.joint(OBJECT).qposadr[0] :][:7]
+            moved = float(np.linalg.norm(pose[:3] - start[:3]))
+            turned = float(2.0 * np.arccos(min(1.0, abs(pose[3:] @ start[3:]))))
+        R = data.site_xmat[self._sites].reshape(-1, 3, 3).copy()
+        return Truth(grasp, forces, R, moved, turned, tuple(dict.fromkeys(links)), tuple(table))
+
+    # ------------------------------------------------------------ the driver
+
+    def move(self, q: np.ndarray, duration: float) -> float:
+        """See Driver."""
+        q = self.robot.require_q("SimulatedHand.move: q", q)
+        positive("SimulatedHand.move: duration", duration)
+        to = np.clip(q + self._errors.miss(len(q)), self.limits.lower, self.limits.upper)
+        least = PEAK * np.abs(to - self._goal) / (SPEED_SHARE * self.limits.speed)
+        steps = int(np.ceil(max(duration, least.max()) / self._dt))
+        self._ramp = (self._goal.copy(), to, 0, steps)
+        self._rest()
+        self._fault = ""
+        return steps * self._dt
+
+    def close(self, finger: int, speed: float, force: float) -> None:
+        """See Driver."""
+        if not 0 <= finger < len(self._tips):
+            raise InputError(f"no finger {finger}; there are {len(self._tips)}, from 0 on")
+        positive("SimulatedHand.close: speed", speed)
+        positive("SimulatedHand.close: force", force)
+        self._fault = ""
+        self._ramp = None
+        j = self._flexion[finger]
+        if self._mode[finger] != CLOSING:
+            self._zero[finger] = self._middle()[finger]
+            self._now[finger] = 0.0
+        self._mode[finger] = CLOSING
+        self._speed[finger] = min(speed, SPEED_SHARE * self.limits.speed[j])
+        self._force[finger] = min(force, PRESS * self.limits.force)
+        self._touched[finger] = self._stalled[finger] = False
+
+    def hold(self, force: float) -> None:
+        """See Driver."""
+        positive("SimulatedHand.hold: force", force)
+        for i, mode in enumerate(self._mode):
+            if mode == HOLDING:
+                self._force[i] = min(force, PRESS * self.limits.force)
+
+    def stop(self) -> None:
+        """See Driver."""
+        self._ramp = None
+        self._rest()
+        q = self._state[1 + self._q]
+        self._goal = np.clip(self._errors.joints(q), self.limits.lower, self.limits.upper)
+
+    def wait(self, duration: float) -> Readings:
+        """See Driver."""
+        if not 0.0 <= duration < np.inf:
+            raise InputError(f"wait takes a finite time of at least 0 s; got {duration}")
+        intervals = max(1, int(np.ceil(duration / (self._every * self._dt) - 1e-9)))
+        left, silence = intervals * self._every, round(self.limits.watchdog / self._dt)
+        states, felt, torques, true = [], [], [], []
+        while left:
+            if silence == 0 and (self._ramp or any(self._mode)):
+                self.stop()
+                self._fault = f"watchdog: no call for {self.limits.watchdog:g} s"
+            T = min(left, silence or left, self._chunk())
+            ctrl = self._plan(T)
+            state, sensors = self._run(ctrl)
+            wrench = -sensors[:, self._wrench].reshape(T, -1, 6)
+            late = np.concatenate([self._tail, wrench]) if self._late else wrench
+            reading = self._errors.wrench(state[:, 0], late[:T])
+            done = self._react(state, reading)
+            self._state = state[done - 1].copy()
+            if self._late:
+                self._tail = late[done : done + self._late]
+            if done < T:
+                self._warm = np.zeros_like(self._warm)
+            self._last = reading[max(0, done - self._every) : done]
+            states.append(state[:done])
+            felt.append(reading[:done])
+            torques.append(sensors[:done, self._torque])
+            true.append(wrench[:done])
+            left -= done
+            silence = max(0, silence - done)
+        return self._readings(*map(np.concatenate, (states, felt, torques, true)))
+
+    # ------------------------------------------------------------ the fast loop
+
+    def _chunk(self) -> int:
+        if CLOSING in self._mode:
+            return CLOSING_STEPS
+        return HOLDING_STEPS if HOLDING in self._mode else MOVING_STEPS
+
+    def _plan(self, T: int) -> np.ndarray:
+        """Targets of the servos (T, nu) over the next steps; moves the goal along."""
+        after = np.arange(1, T + 1)
+        goal = np.repeat(self._goal[None], T, axis=0)
+        speed = np.zeros_like(goal)
+        if self._ramp is not None:
+            start, end, step, steps = self._ramp
+            s = np.minimum((step + after) / steps, 1.0)[:, None]
+            goal = start + (end - start) * (s**3 * (10.0 + s * (6.0 * s - 15.0)))
+            speed = (end - start) * (30.0 * s**2 * (1.0 - s) ** 2 / (steps * self._dt))
+            self._ramp = (start, end, step + T, steps) if step + T < steps else None
+        closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
+        if closing:
+            j = self._flexion[closing]
+            now, wanted = np.array(self._now)[closing], np.array(self._speed)[closing]
+            gain = (CLOSING_ACCELERATION * self._dt * after)[:, None]
+            v = now + np.minimum(np.maximum(wanted - now, -gain), gain)
+            speed[:, j] = v
+            goal[:, j] = np.minimum(goal[0, j] + v.cumsum(axis=0) * self._dt, self.limits.upper[j])
+        if HOLDING in self._mode:
+            felt = self._middle() - self._zero
+            q, share = self._measured(), after / T
+            for i, mode in enumerate(self._mode):
+                if mode == HOLDING:
+                    j = self._flexion[i]
+                    correction = self._correction(i, math.hypot(*felt[i]), float(q[j]), T)
+                    goal[:, j] += correction * share
+        ctrl = np.zeros((T, self.model.nu))
+        told = goal - self._errors.encoder_offset
+        slack = self._errors.about.backlash / 2.0
+        if slack:
+            play = self._play
+            for t in range(T):
+                play = np.clip(play, told[t] - slack, told[t] + slack)
+                told[t] = play
+        for i in self._errors.stalled(float(self._state[0])):
+            j = self._flexion[i]
+            told[:, j], speed[:, j] = self._play[j], 0.0
+        ctrl[:, self._servo] = told + self._lag * speed
+        self._planned = goal, speed, told
+        return ctrl
+
+    def _correction(self, i: int, felt: float, q: float, T: int) -> float:
+        """How far holding moves finger i's target over the next T steps [rad]."""
+        j, give = self._flexion[i], self._give[i]
+        change = _within(self._force[i] - self._aim[i], FORCE_RATE * T * self._dt)
+        self._aim[i] += change
+        wanted = give * (0.5 * change + FORCE_GAIN * (self._aim[i] - felt))
+        now = float(self._goal[j])
+        goal = now + _within(wanted, HOLDING_SPEED * T * self._dt)
+        # However little a broken sensor says, the servo's own error bounds the force.
+        most = min(q + LEAD * give * self._force[i] + STALL, float(self.limits.upper[j]))
+        return max(min(goal, most), float(self.limits.lower[j])) - now
+
+    def _run(self, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Simulate; states (T, ·) after each step, and sensors (T, ·) during it."""
+        T = len(ctrl)
+        states = np.empty((1, T, len(self._state)))
+        sensors = np.empty((1, T, self.model.nsensordata))
+        self._rollout.rollout(
+            [self.model],
+            [self._data],
+            self._state[None],
+            ctrl[None],
+            skip_checks=True,
+            nstep=T,
+            initial_warmstart=self._warm[None],
+            state=states,
+            sensordata=sensors,
+        )
+        self._warm = self._data.qacc_warmstart.copy()
+        self.simulated += T
+        return states[0], sensors[0]
+
+    def _react(self, state: np.ndarray, wrench: np.ndarray) -> int:
+        """See what happened first in these steps, act on it; return how many steps stand."""
+        T = len(state)
+        goal, speed, told = self._planned
+        first, what = T, None  # what happens at the end of step `first`, if anything
+        force = wrench[:, :, :3]
+        square, guard = (force * force).sum(axis=2), (GUARD * self.limits.force) ** 2
+        if square.max() > guard:
+            over = _twice(square > guard)
+            if over.any():
+                first = int(np.argmax(over.any(axis=1)))
+                what = ("guard", int(np.argmax(over[first])))
+        for i, mode in enumerate(self._mode):
+            if mode != CLOSING:
+                continue
+            change = force[:, i] - self._zero[i]
+            touch = _first(_twice((change * change).sum(axis=1) > self._force[i] ** 2))
+            if touch < first:
+                first, what = touch, ("touch", i)
+            j = self._flexion[i]
+            behind = goal[:, j] - self._errors.encoder_offset[j] - state[:, 1 + self._q[j]]
+            stuck = _first(behind > STALL + 0.5 * self._lag[j] * speed[:, j])
+            if stuck < first:
+                first, what = stuck, ("stall", i)
+        beside = np.abs(goal - self._errors.encoder_offset - state[:, 1 + self._q])
+        if beside.max() > FOLLOWING:
+            away = _first((beside > FOLLOWING).any(axis=1))
+            if away < first:
+                first, what = away, ("held", int(beside[away].argmax()))
+        done = min(first + 1, T)
+        self._goal = goal[done - 1].copy()
+        self._play = told[done - 1].copy()
+        for i in range(len(self._mode)):
+            self._now[i] = float(speed[done - 1, self._flexion[i]])
+        if what is None:
+            return done
+        kind, i = what
+        self._state = state[done - 1].copy()
+        if kind == "held":
+            self.stop()
+            self._fault = f"something holds {self.robot.joints[i]}: it does not follow"
+        elif kind == "guard":
+            name = self.robot.description.contact_points[i].name
+            self.stop()
+            self._fault = f"contact force above {GUARD * self.limits.force:g} N at {name}"
+        elif kind == "touch":
+            self._begin_holding(i)
+        else:
+            self._mode[i] = IDLE
+            self._now[i] = 0.0
+            self._stalled[i] = True
+            self._goal[self._flexion[i]] = self._measured()[self._flexion[i]]
+        return done
+
+    def _middle(self) -> np.ndarray:
+        """Force (k, 3) [N] at the tips lately: the median, for a spike is nothing."""
+        return np.sort(self._last[:, :, :3], axis=0)[len(self._last) // 2]
+
+    def _begin_holding(self, i: int) -> None:
+        j = self._flexion[i]
+        q = self._measured()
+        J = self.robot.jacobian(np.clip(q, self.limits.lower, self.limits.upper))
+        self._give[i] = float(np.linalg.norm(J[3 * i : 3 * i + 3, j]) / self._kp[j])
+        self._mode[i], self._touched[i], self._now[i] = HOLDING, True, 0.0
+        self._aim[i] = self._force[i]
+        self._goal[j] = min(q[j] + self._give[i] * self._force[i], self.limits.upper[j])
+
+    def _measured(self) -> np.ndarray:
+        return self._errors.joints(self._state[1 + self._q])
+
+    def _rest(self) -> None:
+        self._mode = [IDLE] * len(self._mode)
+        self._now = [0.0] * len(self._mode)
+        self._touched, self._stalled = np.zeros_like(self._touched), np.zeros_like(self._stalled)
+
+    def _readings(
+        self, states: np.ndarray, felt: np.ndarray, torques: np.ndarray, true: np.ndarray
+    ) -> Readings:
+        velocity = states[:, 1 + self.model.nq + self._v]
+        q = states[:, 1 + self._q]
+        outside = np.maximum(self.limits.lower - q, q - self.limits.upper).max()
+        force = np.sqrt(np.einsum("tia,tia->ti", true[..., :3], true[..., :3])).max()
+        speed = np.abs(velocity).max(axis=0) / self.limits.speed
+        torque = np.abs(torques).max(axis=0) / self.limits.torque
+        for name, value in zip(
+            self.worst, (max(0.0, outside), speed.max(), torque.max(), force), strict=True
+        ):
+            self.worst[name] = max(self.worst[name], float(value))
+        at = slice(self._every - 1, None, self._every)
+        return Readings(
+            time=states[at, 0],
+            q=self._errors.joints(q[at]),
+            velocity=velocity[at],
+            wrench=felt[at],
+            touched=self._touched,
+            stalled=self._stalled,
+            fault=self._fault,
+        )
+
+
+def _within(value: float, most: float) -> float:
+    """`value`, cut to ± most."""
+    return max(-most, min(value, most))
+
+
+def _first(happens: np.ndarray) -> int:
+    """The first step at which it happens, past the last where it does not."""
+    at = int(happens.argmax())
+    return at if happens[at] else len(happens)
+
+
+def _twice(above: np.ndarray) -> np.ndarray:
+    """Where `above` (t, …) holds at a step and at the one before it: a spike is nothing."""
+    both = above.copy()
+    both[1:] &= above[:-1]
+    both[:1] = False
+    return both
+
+
+def _only(flexion: tuple[int, ...]) -> int:
+    if len(flexion) != 1:
+        raise InputError(
+            f"a finger has {len(flexion)} flexion joints; the simulated hand closes one a finger"
+        )
+    return flexion[0]
+
+
+def _servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> np.ndarray:
+    """The actuator (n,) of each joint."""
+    found = []
+    for name in joints:
+        drives = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (
+            model.actuator_trnid[:, 0] == model.joint(name).id
+        )
+        affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        (servo,) = np.nonzero(drives & affine & (model.actuator_forcelimited != 0))
+        if len(servo) != 1:
+            raise ModelError(
+                f"joint {name!r} needs one position actuator with a forcerange; it has {len(servo)}"
+            )
+        found.append(int(servo[0]))
+    return np.array(found)
+
+
+def _model(scene: Scene, physics: Physics, links: str) -> mujoco.MjModel:
+    """Robot, object and what it stands on, with sensors at the tips and servos."""
+    spec, robot = scene.spec(), scene.articulated
+    spec.option.timestep = physics.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    bodies = {body.name: body for body in spec.bodies}
+    thing = bodies.pop(OBJECT)
+    bodies.pop("world")
+    for body in bodies.values():
+        body.gravcomp = 1.0 + physics.imperfections.gravity_error
+    for geom in thing.geoms:
+        # The object decides how a contact is: else its friction would be the larger of both geoms'.
+        geom.priority, geom.condim = 1, 4
+        geom.solref, geom.solimp = CONTACTS[physics.contact]
+        geom.friction = (physics.friction, SPIN_FRICTION, 1e-4)
+        if not (geom.contype or geom.conaffinity):
+            geom.mass = 0.0  # drawn, not felt
+    if physics.support != "fixed":
+        thing.add_freejoint(name=OBJECT)
+        bottom, width = _foot(scene)
+        if physics.support == "pedestal":
+            half = max(0.02, bottom / 2.0)
+            size, kind = [0.5 * width, half, 0.0], mujoco.mjtGeom.mjGEOM_CYLINDER
+        else:
+            half, kind = 0.02, mujoco.mjtGeom.mjGEOM_BOX
+            size = [0.3, 0.3, half]
+        x, y, _ = scene.position
+        spec.worldbody.add_geom(name="support", type=kind, size=size, pos=[x, y, bottom - half])
+    if links == "pass":
+        points = robot.description.contact_points
+        tips = {robot.model.geom(p.geom).bodyid[0] for p in points}
+        for name in bodies:
+            if robot.model.body(name).id not in tips:
+                spec.add_exclude(bodyname1=name, bodyname2=OBJECT)
+    for point in robot.description.contact_points:
+        for kind, word in (
+            (mujoco.mjtSensor.mjSENS_FORCE, "force"),
+            (mujoco.mjtSensor.mjSENS_TORQUE, "torque"),
+        ):
+            spec.add_sensor(
+                name=f"{point.name} touch {word}",
+                type=kind,
+                objtype=mujoco.mjtObj.mjOBJ_SITE,
+                objname=point.site,
+            )
+    for joint in robot.joints:
+        spec.add_sensor(
+            name=f"{joint} torque",
+            type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=joint,
+        )
+    model = spec.compile()
+    if physics.support != "fixed":
+        body = model.body(OBJECT).id
+        share = physics.mass / model.body_mass[body]
+        model.body_mass[body] *= share
+        model.body_inertia[body] *= share
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _foot(scene: Scene) -> tuple[float, float]:
+    """Height of the object's lowest point [m], and half its narrowest horizontal width [m]."""
+    model, robot = scene.model, scene.articulated
+    data = mujoco.MjData(model)
+    robot.place(data, robot.home)
+    lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
+    for geom in np.flatnonzero(model.geom_bodyid == model.body(OBJECT).id):
+        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+            middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            R = data.geom_xmat[geom].reshape(3, 3)
+            center, reach = data.geom_xpos[geom] + R @ middle, np.abs(R) @ half
+            lower, upper = np.minimum(lower, center - reach), np.maximum(upper, center + reach)
+    return float(lower[2]), float((upper - lower)[:2].min() / 2.0)

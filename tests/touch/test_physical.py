@@ -1,0 +1,288 @@
+"""The physical probe: what it feels is what is there, and what goes wrong is told by its reason."""
+
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hqp_grasp as hg
+from hqp_grasp.touch.imperfections import FAULTS, PRESETS, Fault, SensorErrors
+from hqp_grasp.touch.physical import payload, weight
+
+POSTURE = np.array([0.62, 1.12, -0.73, 1.96, 0.63, -0.41, 0.49, 0.21, 1.01, 0.99, 0.98])
+AWAY = np.array([0.62, 0.5, -0.73, 1.96, 0.63, -0.41, 0.49, 0.21, 1.01, 0.99, 0.98])
+FELT = {"stiff": (0.02, 0.1), "medium": (0.05, 0.35), "default": (0.2, 1.4)}  # [mm], [°] at 1 N
+PLACE = 0.5e-3  # [m] a contact in the world: coupling and servos bend, too
+STEADY = 0.1  # [N] of 1 N
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return hg.Scene(object=hg.Cylinder(0.05))
+
+
+def touch(scene, physics=None, force=1.0, **settings):
+    hand = hg.SimulatedHand(scene, physics, **settings)
+    hand.place(POSTURE)
+    return hand, hg.PhysicalProbe(hand, scene.articulated, force).touch(POSTURE)
+
+
+def degrees(a, b):
+    return np.degrees(2.0 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2.0))
+
+
+# ---------------------------------------------------------------- what is felt is what is
+
+
+@pytest.mark.parametrize("contact", FELT)
+def test_a_sample_without_noise_tells_the_contact_as_mujoco_has_it(scene, contact):
+    hand, felt = touch(scene, hg.Physics(contact), links="pass")
+    assert isinstance(felt, hg.Grasp)
+    wrench = hand.wait(0.5).wrench[-1]
+    truth = hand.truth()
+    pushed = wrench - weight(payload(scene.articulated), truth.R_world_tip)
+    for i, R in enumerate(truth.R_world_tip):
+        np.testing.assert_allclose(R @ pushed[i, :3], truth.forces[i], atol=1e-3)
+        position, normal = hg.sense(pushed[i], 0.008)
+        true = R.T @ truth.grasp.contacts[i].normal
+        assert 1e3 * np.linalg.norm(position + 0.008 * true) < FELT[contact][0]
+        assert degrees(normal, true) < FELT[contact][1]
+
+
+@pytest.mark.parametrize("support", ["fixed", "pedestal"])
+def test_the_grasp_felt_is_the_one_that_is(scene, support):
+    hand, felt = touch(scene, hg.Physics(support=support), links="pass")
+    truth = hand.truth()
+    assert isinstance(felt, hg.Grasp)
+    np.testing.assert_allclose(felt.positions, truth.grasp.positions, atol=PLACE)
+    assert degrees(felt.normals, truth.grasp.normals).max() < FELT["medium"][1]
+    np.testing.assert_allclose(np.linalg.norm(truth.forces, axis=1), 1.0, atol=STEADY)
+    wrenches = np.array([contact.wrench[:3] for contact in felt.contacts])
+    np.testing.assert_allclose(wrenches, truth.forces, atol=STEADY)
+    assert truth.moved == 0.0 if support == "fixed" else 0.0 < truth.moved < 5e-3
+
+
+def test_it_touches_where_the_geometric_probe_does(scene):
+    _, felt = touch(scene, links="pass")
+    exact = hg.GeometricProbe(scene, "pass").touch(POSTURE)
+    np.testing.assert_allclose(felt.positions, exact.positions, atol=PLACE)
+    np.testing.assert_allclose(felt.q, exact.q, atol=0.01)
+
+
+@pytest.mark.parametrize("contact", ["medium", "stiff"])
+def test_closing_is_guarded(scene, contact):
+    hand, felt = touch(scene, hg.Physics(contact), links="pass")
+    assert isinstance(felt, hg.Grasp)
+    assert hand.worst["force [N]"] < {"medium": 2.0, "stiff": 3.5}[contact]
+    assert 0.0 < hand.worst["speed share"] <= 1.0
+    assert 0.0 < hand.worst["torque share"] <= 1.0
+    assert hand.worst["range [rad]"] == 0.0
+
+
+def test_the_second_touch_begins_where_the_first_ended(scene):
+    hand, first = touch(scene, links="pass")
+    second = hg.PhysicalProbe(hand, scene.articulated).touch(first.q)
+    np.testing.assert_allclose(second.positions, first.positions, atol=PLACE)
+
+
+def test_bias_and_weight_are_none_of_what_is_felt(scene):
+    biased = hg.Imperfections(force_bias=0.5, torque_bias=5e-3)
+    _, plain = touch(scene, links="pass")
+    _, felt = touch(scene, hg.Physics(imperfections=biased), links="pass")
+    np.testing.assert_allclose(felt.positions, plain.positions, atol=1e-4)
+    np.testing.assert_allclose(felt.normals, plain.normals, atol=5e-3)
+
+
+# ---------------------------------------------------------------- misses
+
+
+def test_fingers_that_close_on_nothing_say_so(scene):
+    hand = hg.SimulatedHand(scene, links="pass")
+    hand.place(AWAY)
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(AWAY)
+    assert isinstance(felt, hg.Missed)
+    assert felt.reason in (hg.Miss.NO_TOUCH, hg.Miss.OWN_LINK, hg.Miss.OTHER_LINK)
+
+
+def test_an_object_in_the_way_stops_the_hand_below_its_force_limit(scene):
+    hand = hg.SimulatedHand(scene)
+    hand.place(AWAY)
+    pushed_into = POSTURE.copy()
+    pushed_into[1] += 0.35
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(pushed_into)
+    assert isinstance(felt, hg.Missed)
+    assert hand.worst["force [N]"] <= hand.limits.force
+    assert hand.worst["speed share"] <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "reasons"),
+    [
+        ("dropout", {hg.Miss.SENSOR}),
+        ("freeze", {hg.Miss.SENSOR}),
+        ("stall", {hg.Miss.OTHER_LINK, hg.Miss.SENSOR}),
+    ],
+)
+def test_what_breaks_before_the_touch_is_told_and_hurts_nobody(scene, kind, reasons):
+    fault = Fault(kind, finger=1, begin=0.9)
+    physics = hg.Physics(imperfections=hg.Imperfections(faults=(fault,)))
+    hand, felt = touch(scene, physics, links="pass")
+    assert isinstance(felt, hg.Missed)
+    assert felt.reason in reasons and felt.where == "finger_2"
+    assert hand.worst["force [N]"] <= hand.limits.force
+
+
+@pytest.mark.parametrize("begin", [0.5, 1.0, 1.4, 1.6, 1.8, 2.0])
+@pytest.mark.parametrize("kind", FAULTS)
+def test_whenever_something_breaks_the_answer_is_a_grasp_or_a_miss_within_the_limits(
+    scene, kind, begin
+):
+    fault = Fault(kind, finger=0, begin=begin, duration=0.002 if kind == "spike" else np.inf)
+    physics = hg.Physics(imperfections=hg.Imperfections(faults=(fault,)))
+    hand, felt = touch(scene, physics, links="pass")
+    assert isinstance(felt, hg.Grasp | hg.Missed)
+    assert hand.worst["force [N]"] <= hand.limits.force
+    if kind == "spike":
+        assert isinstance(felt, hg.Grasp)
+        error = degrees(felt.normals, hand.truth().grasp.normals)
+        assert error.max() < 1.0
+
+
+# ---------------------------------------------------------------- imperfections
+
+
+def errors(**about):
+    return SensorErrors(hg.Imperfections(**about), 3, np.arange(11) < 7, np.random.default_rng(5))
+
+
+def test_each_sensor_error_is_what_its_name_says():
+    time, still = np.linspace(0.0, 60.0, 4001), np.zeros((4001, 3, 6))
+    noise = errors(force_noise=0.02, torque_noise=2e-4).wrench(time, still)
+    np.testing.assert_allclose(noise.std(axis=0)[:, :3], 0.02, rtol=0.1)
+    np.testing.assert_allclose(noise.std(axis=0)[:, 3:], 2e-4, rtol=0.1)
+    bias = errors(force_bias=0.1).wrench(time, still)
+    assert np.ptp(bias, axis=0).max() == 0.0 and 0.02 < np.abs(bias[0, :, :3]).mean() < 0.3
+    drift = errors(torque_drift=1e-4).wrench(time, still)
+    assert np.abs(drift[0]).max() == 0.0 and 2e-5 < np.abs(drift[-1, :, 3:]).mean() < 3e-4
+    steps = errors(force_step=0.1).wrench(time, still + 0.26)
+    np.testing.assert_allclose(steps[..., :3], 0.3)
+    np.testing.assert_allclose(steps[..., 3:], 0.26)
+
+
+def test_encoders_err_by_a_constant_and_by_their_step():
+    about = errors(encoder_offset=0.01, encoder_step=1e-3)
+    q = np.full(11, 0.5)
+    read = about.joints(q)
+    assert 1e-3 < np.abs(read - q).mean() < 0.03
+    np.testing.assert_allclose(read / 1e-3, np.round(read / 1e-3), atol=1e-9)
+
+
+def test_an_arm_off_leaves_the_hand_right():
+    offset = errors(arm_offset=0.01).encoder_offset
+    assert (offset[:7] != 0.0).all() and (offset[7:] == 0.0).all()
+
+
+def test_the_preset_differs_from_perfect_in_every_value_with_a_unit():
+    preset = PRESETS["loadcell"]
+    assert hg.Imperfections.preset("loadcell") is not None
+    assert hg.Imperfections.preset(None) == hg.Imperfections()
+    assert preset.force_noise > 0.0 and preset.latency > 0.0 and preset.encoder_offset > 0.0
+    assert replace(preset, force_noise=0.0) == hg.Imperfections.preset("loadcell", force_noise=0.0)
+    with pytest.raises(hg.InputError, match="choose one of: loadcell"):
+        hg.Imperfections.preset("perfect")
+
+
+def test_the_floor_is_what_noise_makes_of_a_balanced_grasp():
+    about, rng = hg.Imperfections(force_noise=0.02, torque_noise=2e-4), np.random.default_rng(0)
+    angles = 2.0 * np.pi * np.arange(3) / 3.0
+    normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    eps = []
+    for _ in range(2000):
+        net = np.zeros(3)
+        for n in normals:
+            wrench = np.concatenate([n, np.zeros(3)])
+            wrench += np.repeat([0.02, 2e-4], 3) * rng.normal(size=6) / np.sqrt(10)
+            net += hg.sense(wrench, 0.008)[1]
+        eps.append(net @ net)
+    floor, _ = about.floor(1.0, 0.008, 0.05)
+    np.testing.assert_allclose(np.mean(eps), floor, rtol=0.1)
+
+
+def test_latency_delays_what_is_felt(scene):
+    late = hg.Physics(imperfections=hg.Imperfections(latency=0.02))
+    prompt, delayed = hg.SimulatedHand(scene), hg.SimulatedHand(scene, late)
+    q = prompt.robot.home.copy()
+    q[8] += 0.3
+    read = []
+    for hand in (prompt, delayed):
+        hand.move(q, 0.3)
+        read.append(hand.wait(0.3).wrench[:, 0])
+    np.testing.assert_array_equal(read[0][:-2], read[1][2:])
+
+
+def test_backlash_keeps_a_joint_behind_by_half_the_play(scene):
+    hand = hg.SimulatedHand(scene, hg.Physics(imperfections=hg.Imperfections(backlash=0.02)))
+    q = hand.robot.home.copy()
+    q[3] += 0.1
+    hand.wait(hand.move(q, 0.5))
+    np.testing.assert_allclose(hand.wait(0.5).q[-1][3], q[3] - 0.01, atol=1e-4)
+
+
+# ---------------------------------------------------------------- trials
+
+
+def trial(scene, preset=None):
+    return hg.Trial(scene, hg.stack_of("fmk"), 8, links="pass", probe="physical", preset=preset)
+
+
+def test_a_trial_balances_the_grasp_by_touch_alone(scene):
+    record = trial(scene).run((3, 1))
+    assert record.converged_at is not None
+    assert record.rows[-1]["eps_f_true"] < 1e-3 and record.rows[-1]["eps_m_true"] < 4e-6
+
+
+def test_a_trial_is_the_same_to_the_last_bit_in_another_process(scene):
+    code = (
+        "import sys, pickle, hqp_grasp as hg; "
+        "scene = hg.Scene(object=hg.Cylinder(0.05)); "
+        "trial = hg.Trial(scene, hg.stack_of('fmk'), 3, links='pass', "
+        "probe='physical', preset='loadcell'); "
+        "sys.stdout.buffer.write(pickle.dumps([g.q for g in trial.run((3, 1)).grasps]))"
+    )
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    here = hg.Trial(
+        scene, hg.stack_of("fmk"), 3, links="pass", probe="physical", preset="loadcell"
+    ).run((3, 1))
+    for one, same in zip(here.grasps, pickle.loads(other.stdout), strict=True):
+        np.testing.assert_array_equal(one.q, same)
+
+
+def test_a_preset_needs_a_hand_that_can_be_imperfect(scene):
+    with pytest.raises(hg.InputError, match="needs probe='physical'"):
+        hg.Trial(scene, hg.stack_of("fmk"), preset="loadcell")
+    with pytest.raises(hg.InputError, match="choose one of: geometric, physical"):
+        hg.Trial(scene, hg.stack_of("fmk"), probe="real")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"contact": "soft"}, "stiff, medium, default"),
+        ({"support": "air"}, "fixed, pedestal, table"),
+        ({"mass": 0.0}, "Physics.mass"),
+        ({"imperfections": "loadcell"}, "must be Imperfections"),
+    ],
+)
+def test_a_physics_that_cannot_be_is_refused(wrong, words):
+    with pytest.raises(hg.InputError, match=words):
+        hg.Physics(**wrong)
+
+
+def test_a_hand_in_the_object_is_refused(scene):
+    inside = POSTURE.copy()
+    inside[3] -= 0.3
+    with pytest.raises(hg.InputError, match="is in the object, with open fingers"):
+        hg.SimulatedHand(scene).place(inside)
