@@ -68,24 +68,41 @@ class PhysicalProbe:
         object.__setattr__(self, "_own", _own_links(self.robot))
 
     def touch(self, q_target: np.ndarray) -> Grasp | Missed:
-        """Move to q_target (n,) [rad], close every finger, and return the grasp felt there."""
-        robot, driver, limits = self.robot, self.driver, self.driver.limits
-        target = robot.require_q("q_target", q_target)
-        flexion = np.array([j for (j,) in robot.flexion])
-        opened = np.clip(driver.wait(0.0).q[-1], limits.lower, limits.upper)
-        opened[flexion] = np.maximum(limits.lower[flexion], opened[flexion] - RETREAT)
-        away = target.copy()
-        away[flexion] = np.maximum(limits.lower[flexion], away[flexion] - RETREAT)
+        """Move to q_target (n,) [rad], close every finger, and return the grasp felt there.
+
+        A touch that misses ends where it began, its fingers open: the next one approaches from
+        where the last grasp was felt.
+        """
+        away = self.robot.require_q("q_target", q_target).copy()
+        flexion = np.array([j for (j,) in self.robot.flexion])
+        expected = away[flexion]
+        away[flexion] = np.maximum(self.driver.limits.lower[flexion], expected - RETREAT)
+        opened = self._opened(away)
+        felt = self._touch(opened, away, expected)
+        if isinstance(felt, Missed):
+            self._go(self._opened(away), OPENING)
+            self._go(opened, MOVING)
+        return felt
+
+    def _opened(self, away: np.ndarray) -> np.ndarray:
+        """Where the hand is, each finger opened by RETREAT, and at least as far as in `away`."""
+        limits, flexion = self.driver.limits, [j for (j,) in self.robot.flexion]
+        q = np.clip(self.driver.wait(0.0).q[-1], limits.lower, limits.upper)
+        opened = np.minimum(q[flexion] - RETREAT, away[flexion])
+        q[flexion] = np.maximum(limits.lower[flexion], opened)
+        return q
+
+    def _touch(self, opened: np.ndarray, away: np.ndarray, expected: np.ndarray) -> Grasp | Missed:
         for q, duration in ((opened, OPENING), (away, MOVING)):
             fault = self._go(q, duration)
             if fault:
                 return Missed(Miss.BLOCKED, fault)
-        driver.wait(RESTING)
-        free = driver.wait(WEIGHING)
-        missed = self._close(target[flexion], flexion)
+        self.driver.wait(RESTING)
+        free = self.driver.wait(WEIGHING)
+        missed = self._close(free, expected)
         if missed is not None:
             return missed
-        driver.hold(self.force)
+        self.driver.hold(self.force)
         return self._sense(free, self._settle(free))
 
     def _settle(self, free: Readings) -> Readings:
@@ -116,11 +133,11 @@ class PhysicalProbe:
             left -= slice_
         return ""
 
-    def _close(self, expected: np.ndarray, flexion: np.ndarray) -> Missed | None:
+    def _close(self, readings: Readings, expected: np.ndarray) -> Missed | None:
         """Close all fingers; None once all have touched."""
         driver, limits = self.driver, self.driver.limits
+        flexion = [j for (j,) in self.robot.flexion]
         names = [point.name for point in self.robot.description.contact_points]
-        readings = driver.wait(0.0)
         way = np.maximum(expected - EXPECTED - readings.q[-1][flexion], 0.0)
         swift = float(way.max()) / SWIFT
         if swift > 0.0:

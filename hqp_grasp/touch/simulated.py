@@ -37,7 +37,7 @@ HOLDING_SPEED = 0.3  # [rad/s] that holding corrects by, at most
 LEAD = 2.0  # times the servo's give at the held force, by which a target leads its joint at most
 GUARD = 0.6  # share of the force limit at which the driver stops
 PRESS = 0.4  # share of the force limit that is held, at most
-MOVING_STEPS, CLOSING_STEPS, HOLDING_STEPS = 200, 25, 20  # in one call of the simulator
+MOVING, REACTING = 0.4, 0.05  # [s] in one call of the simulator, and while fingers press
 IDLE, CLOSING, HOLDING = 0, 1, 2
 
 
@@ -341,9 +341,7 @@ class SimulatedHand:
     # ------------------------------------------------------------ the fast loop
 
     def _chunk(self) -> int:
-        if CLOSING in self._mode:
-            return CLOSING_STEPS
-        return HOLDING_STEPS if HOLDING in self._mode else MOVING_STEPS
+        return math.ceil((REACTING if any(self._mode) else MOVING) / self._dt)
 
     def _plan(self, T: int) -> np.ndarray:
         """Targets of the servos (T, nu) over the next steps; moves the goal along."""
@@ -353,8 +351,8 @@ class SimulatedHand:
         if self._ramp is not None:
             start, end, step, steps = self._ramp
             s = np.minimum((step + after) / steps, 1.0)[:, None]
-            goal = start + (end - start) * (s**3 * (10.0 + s * (6.0 * s - 15.0)))
-            speed = (end - start) * (30.0 * s**2 * (1.0 - s) ** 2 / (steps * self._dt))
+            goal = start + (end - start) * (s * s * s * (10.0 + s * (6.0 * s - 15.0)))
+            speed = (end - start) * (30.0 * (s * (1.0 - s)) ** 2 / (steps * self._dt))
             self._ramp = (start, end, step + T, steps) if step + T < steps else None
         closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
         if closing:
@@ -425,29 +423,27 @@ class SimulatedHand:
         goal, speed, told = self._planned
         first, what = T, None  # what happens at the end of step `first`, if anything
         force = wrench[:, :, :3]
-        square, guard = (force * force).sum(axis=2), (GUARD * self.limits.force) ** 2
+        square, guard = _squares(force), (GUARD * self.limits.force) ** 2
         if square.max() > guard:
             over = _twice(square > guard)
             if over.any():
                 first = int(np.argmax(over.any(axis=1)))
                 what = ("guard", int(np.argmax(over[first])))
-        for i, mode in enumerate(self._mode):
-            if mode != CLOSING:
-                continue
-            change = force[:, i] - self._zero[i]
-            touch = _first(_twice((change * change).sum(axis=1) > self._force[i] ** 2))
-            if touch < first:
-                first, what = touch, ("touch", i)
-            j = self._flexion[i]
-            behind = goal[:, j] - self._errors.encoder_offset[j] - state[:, 1 + self._q[j]]
-            stuck = _first(behind > STALL + 0.5 * self._lag[j] * speed[:, j])
-            if stuck < first:
-                first, what = stuck, ("stall", i)
-        beside = np.abs(goal - self._errors.encoder_offset - state[:, 1 + self._q])
-        if beside.max() > FOLLOWING:
-            away = _first((beside > FOLLOWING).any(axis=1))
-            if away < first:
-                first, what = away, ("held", int(beside[away].argmax()))
+        behind = goal - self._errors.encoder_offset - state[:, 1 + self._q]
+        closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
+        if closing:
+            j = self._flexion[closing]
+            change = _squares(force[:, closing] - self._zero[closing])
+            touched = change > np.array(self._force)[closing] ** 2
+            stuck = behind[:, j] > STALL + 0.5 * self._lag[j] * speed[:, j]
+            for kind, happens in (("touch", _twice(touched)), ("stall", stuck)):
+                if happens[:first].any():
+                    first = int(np.argmax(happens.any(axis=1)))
+                    what = (kind, closing[int(np.argmax(happens[first]))])
+        beside = np.abs(behind)
+        if beside[:first].max(initial=0.0) > FOLLOWING:
+            first = int(np.argmax((beside > FOLLOWING).any(axis=1)))
+            what = ("held", int(beside[first].argmax()))
         done = min(first + 1, T)
         self._goal = goal[done - 1].copy()
         self._play = told[done - 1].copy()
@@ -499,12 +495,12 @@ class SimulatedHand:
     ) -> Readings:
         velocity = states[:, 1 + self.model.nq + self._v]
         q = states[:, 1 + self._q]
-        outside = np.maximum(self.limits.lower - q, q - self.limits.upper).max()
-        force = np.sqrt(np.einsum("tia,tia->ti", true[..., :3], true[..., :3])).max()
-        speed = np.abs(velocity).max(axis=0) / self.limits.speed
-        torque = np.abs(torques).max(axis=0) / self.limits.torque
+        outside = np.maximum(self.limits.lower - q.min(axis=0), q.max(axis=0) - self.limits.upper)
+        speed = np.maximum(velocity.max(axis=0), -velocity.min(axis=0)) / self.limits.speed
+        torque = np.maximum(torques.max(axis=0), -torques.min(axis=0)) / self.limits.torque
+        force = math.sqrt(_squares(true[..., :3]).max())
         for name, value in zip(
-            self.worst, (max(0.0, outside), speed.max(), torque.max(), force), strict=True
+            self.worst, (outside.max(), speed.max(), torque.max(), force), strict=True
         ):
             self.worst[name] = max(self.worst[name], float(value))
         at = slice(self._every - 1, None, self._every)
@@ -524,10 +520,9 @@ def _within(value: float, most: float) -> float:
     return max(-most, min(value, most))
 
 
-def _first(happens: np.ndarray) -> int:
-    """The first step at which it happens, past the last where it does not."""
-    at = int(happens.argmax())
-    return at if happens[at] else len(happens)
+def _squares(force: np.ndarray) -> np.ndarray:
+    """|f|² (t, k) of forces (t, k, 3)."""
+    return np.einsum("tia,tia->ti", force, force)
 
 
 def _twice(above: np.ndarray) -> np.ndarray:

@@ -107,6 +107,17 @@ def test_fingers_that_close_on_nothing_say_so(scene):
     assert felt.reason in (hg.Miss.NO_TOUCH, hg.Miss.OWN_LINK, hg.Miss.OTHER_LINK)
 
 
+def test_a_miss_ends_where_the_touch_began_with_open_fingers(scene):
+    hand = hg.SimulatedHand(scene, links="pass")
+    hand.place(POSTURE)
+    before = hand.wait(0.0).q[-1]
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(AWAY)
+    assert isinstance(felt, hg.Missed)
+    after = hand.wait(0.5).q[-1]
+    np.testing.assert_allclose(after[:8], before[:8], atol=1e-3)
+    assert (after[8:] < POSTURE[8:] - 0.3).all()
+
+
 def test_an_object_in_the_way_stops_the_hand_below_its_force_limit(scene):
     hand = hg.SimulatedHand(scene)
     hand.place(AWAY)
