@@ -168,6 +168,7 @@ class Miss(Enum):
     OTHER_LINK = "another link touches the object"
     BLOCKED = "the hand stopped itself on the way"
     OWN_LINK = "a finger closed onto the hand itself"
+    TABLE = "a fingertip met what the object stands on"
     LOST = "a contact was lost while the hand held"
     UNCLEAR = "what a fingertip feels is no push on it"
     SENSOR = "a fingertip's sensor does not answer"

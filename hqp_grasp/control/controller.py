@@ -25,6 +25,8 @@ from hqp_grasp.world.robot import Robot
 SHARES = (1.0, 0.5, 0.25)  # of a step, tried in turn while it finds nothing to touch
 RETREAT = 0.01  # [m] the palm withdraws by, for each time that a link was in the way
 MAX_RETREATS = 6
+IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE)  # what the palm withdraws from
+MAX_SILENT = 4  # touches from one grasp that a sensor may cost
 CLIP_TOLERANCE = 1e-9  # [rad] a solver's rounding may leave a range by; more is a bug
 
 
@@ -59,10 +61,10 @@ class Controller:
     of one's own stands in the place of these names. A stack without caps gets StepLimit(), one
     without ranges the robot's.
 
-    After a miss without touch the step from the last grasp is taken again, shorter: SHARES of it
-    in turn. Where another link than the fingertips met the object, the palm withdraws on the next
-    step, by RETREAT more at each such miss. Then, or once the `budget` of touches is spent, the
-    controller gives up.
+    After a miss the step is taken again from the last grasp, shorter: SHARES of it in turn. Where
+    another link than the fingertips met the object, or a fingertip the table, the palm withdraws on
+    the next step, by RETREAT more at each such miss. Where a sensor was silent the same step is
+    tried again. Then, or once the `budget` of touches is spent, the controller gives up.
     """
 
     robot: Robot
@@ -104,10 +106,11 @@ class Controller:
             return Step(None, reason="no touch has felt a grasp yet: begin where the hand touches")
         if self.budget is not None and len(history) >= self.budget:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
-        blocked = sum(missed.reason is Miss.OTHER_LINK for missed in misses)
-        short = len(misses) - blocked
+        blocked = sum(missed.reason in IN_THE_WAY for missed in misses)
+        silent = sum(missed.reason is Miss.SENSOR for missed in misses)
+        short = len(misses) - blocked - silent
         shares = getattr(self.form, "shares", SHARES)
-        if short == len(shares) or blocked == MAX_RETREATS:
+        if short == len(shares) or blocked == MAX_RETREATS or silent == MAX_SILENT:
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
@@ -119,7 +122,13 @@ class Controller:
         x = (1.0 if plan.exact else shares[short]) * plan.x
         if self.landing and not plan.exact:
             x = land(self.robot, stack, grasp, x)
-        return Step(self._clipped(grasp, x), (), plan, shares[short])
+        reactions = {
+            f"palm back by {1e3 * blocked * RETREAT:g} mm": blocked,
+            f"{shares[short]:g} of the step": short,
+            "the same again": silent and misses[-1].reason is Miss.SENSOR,
+        }
+        reason = ", ".join(what for what, done in reactions.items() if done)
+        return Step(self._clipped(grasp, x), (), plan, shares[short], reason)
 
     def _latest(self, history: Sequence[Touch]) -> tuple[Grasp | None, list[Missed]]:
         """The last grasp felt, and the misses since."""

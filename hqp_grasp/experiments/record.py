@@ -31,6 +31,7 @@ COLUMNS = {
     "outcome": "touch, or why the probe missed",
     "other_links": "links beside the fingertips that touch the object",
     "step_share": "share of the planned step that was taken",
+    "reaction": "what the controller did about the misses since the last grasp",
     "limit_active": "bool: a limit holds the step that led here",
     "limit_violation": "rad: how far the worst joint is outside its range, commanded or reached",
     "hqp_projection_gap": "rad: largest difference of hierarchy and projection, limits inactive",
@@ -62,7 +63,7 @@ CONTACT_COLUMNS = {
 JOINT_COLUMN = "rad: joint angle"
 # "good", and what keeps a trial from being so, the gravest first.
 VERDICTS = ("good", "error", "lost", "not balanced", "link inside", "violation")
-TEXTS = {"outcome", "other_links", "method", "error"}
+TEXTS = {"outcome", "other_links", "method", "error", "reaction"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

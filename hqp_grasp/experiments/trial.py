@@ -172,8 +172,8 @@ class Trial:
         while len(history) <= self.probes:
             step = controller.step(history)
             if step.q_target is None:
-                row = self._empty(robot, stack) | {"outcome": f"gave up: {step.reason}"}
-                yield row, None
+                told = {"outcome": f"gave up: {step.reason}", "reaction": "gave up"}
+                yield self._empty(robot, stack) | told, None
                 return
             history.append(Touch(step.q_target, touching.touch(step.q_target)))
             yield (
@@ -191,7 +191,7 @@ class Trial:
         rng = np.random.default_rng(np.random.SeedSequence([*entropy, IMPERFECTIONS]))
         hand = SimulatedHand(began.scene, physics, self.links, rng)
         hand.place(began.grasp.q)
-        return hand, PhysicalProbe(hand, began.scene.articulated)
+        return hand, PhysicalProbe(hand, began.scene.articulated, table=hand.table)
 
     def _empty(
         self, robot: Robot, stack: Stack, solution: Solution | None = None
@@ -226,6 +226,7 @@ def _about(step: Step) -> dict[str, object]:
         return {}
     return {
         "step_share": step.share,
+        "reaction": step.reason or None,
         "limit_active": plan.limit_active,
         "hqp_projection_gap": plan.gap,
         "solve_us": plan.solve_us,

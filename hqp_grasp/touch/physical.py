@@ -32,7 +32,8 @@ SENSING = 0.1  # [s] of readings that are averaged
 LOST = 0.5  # share of the held force below which a contact is none
 SPIKE = 0.5  # share of the held force by which a sample lies beside the others, to count as none
 STEEP = 1.5  # [–] tangential by normal force that no fingertip holds
-OWN = 2e-3  # [m] from a link of the robot, a tip touches that link
+NEAR = 2e-3  # [m] from a link of the robot, or from the table, a tip touches that
+UPWARDS = 0.7  # [–] vertical part of a table's normal, at least, as it is felt
 CLOSED = 0.02  # [rad] from the end of its range a finger is closed
 
 
@@ -49,6 +50,7 @@ class PhysicalProbe:
     driver: Driver
     robot: Robot
     force: float = 1.0  # [N] held while the contact is sensed
+    table: float | None = None  # [m] height of what the object stands on, where it is known
     _payload: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)  # kg (k,), m (k, 3)
     _data: mujoco.MjData = field(init=False, repr=False)
     _own: tuple[tuple[int, list[int]], ...] = field(init=False, repr=False)  # tips, what they meet
@@ -191,8 +193,8 @@ class PhysicalProbe:
         robot.place(self._data, q)
         for (tip, links), name in zip(self._own, names, strict=True):
             for link in links:
-                gap = mujoco.mj_geomDistance(robot.model, self._data, tip, link, 2.0 * OWN, None)
-                if gap < OWN:
+                gap = mujoco.mj_geomDistance(robot.model, self._data, tip, link, 2.0 * NEAR, None)
+                if gap < NEAR:
                     return Missed(Miss.OWN_LINK, name)
         R_world_tip = robot.tip_frames(q).copy()
         wrench = self._steady(held) - self._steady(free)
@@ -209,9 +211,11 @@ class PhysicalProbe:
             upright = min(1.0, float(wrench[i, :3] @ normal) / pressed)
             if np.hypot(1.0, STEEP) * upright < 1.0:
                 return Missed(Miss.UNCLEAR, names[i])
-            n = R @ normal
+            n, place = R @ normal, center + R @ position
+            if self.table is not None and place[2] < self.table + NEAR and n[2] > UPWARDS:
+                return Missed(Miss.TABLE, names[i])
             world = np.concatenate([R @ wrench[i, :3], R @ wrench[i, 3:]])
-            contacts.append(Contact(center + R @ position, n, wrench=world, confidence=upright))
+            contacts.append(Contact(place, n, wrench=world, confidence=upright))
         return robot.grasp(q, contacts)
 
     def _steady(self, readings: Readings) -> np.ndarray:

@@ -107,6 +107,7 @@ class SimulatedHand:
         k, n = len(self.robot.flexion), self.robot.n
         self._flexion = np.array([_only(point) for point in self.robot.flexion])
         self._free = physics.support != "fixed"
+        self.table = _foot(scene)[0] if physics.support == "table" else None  # [m] its height
         self.model = _model(scene, physics, links)
         self._data = mujoco.MjData(self.model)
         self._rollout = Rollout(nthread=0)

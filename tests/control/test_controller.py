@@ -124,6 +124,44 @@ def test_misses_shorten_the_step_then_the_controller_gives_up(robot, stack, firs
     )
 
 
+@pytest.mark.parametrize("reason", Miss)
+def test_every_miss_has_a_reaction_and_an_end(robot, stack, first, reason):
+    controller, history, told = Controller(robot, stack, landing=False), [Touch(first.q, first)], []
+    plain = controller.step(history)
+    assert plain.reason == ""
+    while len(told) < 10:
+        history.append(Touch(plain.q_target, Missed(reason, "finger_2")))
+        step = controller.step(history)
+        told.append(step.reason)
+        if step.q_target is None:
+            break
+        if reason is Miss.SENSOR:
+            np.testing.assert_array_equal(step.q_target, plain.q_target)
+        elif reason in (Miss.OTHER_LINK, Miss.TABLE):
+            palms = [robot.palm(q) for q in (first.q, step.q_target)]
+            back = (palms[0][0] - palms[1][0]) @ palms[0][1][:, 2]
+            assert back > 0.01 * len(told) - 2e-3  # at least, to first order
+        else:
+            share = SHARES[len(told)]
+            np.testing.assert_allclose(
+                step.q_target - first.q, share * (plain.q_target - first.q), atol=1e-14
+            )
+    *reactions, last = told
+    assert last.endswith(f"misses from one grasp, the last: {reason.value} (finger_2)")
+    if reason is Miss.SENSOR:
+        assert reactions == ["the same again"] * 3
+    elif reason in (Miss.OTHER_LINK, Miss.TABLE):
+        assert reactions == [f"palm back by {10 * i} mm" for i in range(1, 6)]
+    else:
+        assert reactions == ["0.5 of the step", "0.25 of the step"]
+
+
+def test_a_sensor_that_comes_back_costs_no_share_of_the_step(robot, stack, first):
+    history = [Touch(first.q, first), *[Touch(first.q, Missed(Miss.SENSOR, "finger_1"))] * 2]
+    shorter = Controller(robot, stack).step([*history, Touch(first.q, MISSED)])
+    assert shorter.share == SHARES[1] and shorter.reason == "0.5 of the step"
+
+
 def test_a_touch_after_misses_begins_anew(robot, stack, first):
     controller = Controller(robot, stack)
     history = [Touch(first.q, MISSED), Touch(first.q, MISSED), Touch(first.q, first)]

@@ -309,6 +309,8 @@ def test_the_row_of_a_loss_tells_the_reason_and_later_rows_are_empty(scene, stac
         lost,
         f"gave up: 3 misses from one grasp, the last: {lost}",
     ]
+    reactions = [row["reaction"] for row in rows[1:5]]
+    assert reactions == [None, "0.5 of the step", "0.25 of the step", "gave up"]
     for row in rows[5:]:
         assert row["in_contact"] is False and row["limit_active"] is False
         told = {name for name, value in row.items() if value not in (None, False, 0.0, "")}

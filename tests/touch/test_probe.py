@@ -420,6 +420,7 @@ def test_every_reason_reads_as_one():
         "another link touches the object",
         "the hand stopped itself on the way",
         "a finger closed onto the hand itself",
+        "a fingertip met what the object stands on",
         "a contact was lost while the hand held",
         "what a fingertip feels is no push on it",
         "a fingertip's sensor does not answer",
