@@ -235,8 +235,7 @@ def _silent(readings: Readings) -> np.ndarray:
 def _own_links(robot: Robot) -> tuple[tuple[int, list[int]], ...]:
     """Each tip's geom, and those of the robot that it can meet: all but its own finger's links."""
     model = robot.model
-    tips = [model.geom(point.geom).id for point in robot.description.contact_points]
-    arm = int(model.site(robot.description.palm).bodyid[0])
+    tips, arm = [geoms[0] for geoms in robot.geoms], robot.palm_body
     moving = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] != 0]
     touching = [g for g in moving if model.geom_contype[g] or model.geom_conaffinity[g]]
     found = []

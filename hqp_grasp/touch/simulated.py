@@ -123,7 +123,7 @@ class SimulatedHand:
         lag = -model.actuator_biasprm[self._servo, 2] / self._kp
         self._lag = lag  # [s] a servo stays behind its target, by speed
         points = robot.description.contact_points
-        self._tips = [model.geom(p.geom).id for p in points]
+        self._tips = [model.geom(name).id for name in _round_tips(robot)]
         self._sites = [model.site(p.site).id for p in points]
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         thing = model.geom_bodyid == model.body(OBJECT).id
@@ -542,6 +542,17 @@ def _only(flexion: tuple[int, ...]) -> int:
     return flexion[0]
 
 
+def _round_tips(robot: Robot) -> list[str]:
+    """The geom of each tip, by name."""
+    for point, radius in zip(robot.description.contact_points, robot.tip_radius, strict=True):
+        if radius == 0.0 or not point.site:
+            raise InputError(
+                f"the simulated hand feels with round tips that have a site at their centre; "
+                f"{point.name} of {robot.description.name} has none"
+            )
+    return [robot.model.geom(geoms[0]).name for geoms in robot.geoms]
+
+
 def _servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> np.ndarray:
     """The actuator (n,) of each joint."""
     found = []
@@ -587,11 +598,10 @@ def _model(scene: Scene, physics: Physics, links: str) -> mujoco.MjModel:
         else:
             half, kind = 0.02, mujoco.mjtGeom.mjGEOM_BOX
             size = [0.3, 0.3, half]
-        x, y, _ = scene.position
+        x, y = np.array(scene.position)[:2]
         spec.worldbody.add_geom(name="support", type=kind, size=size, pos=[x, y, bottom - half])
     if links == "pass":
-        points = robot.description.contact_points
-        tips = {robot.model.geom(p.geom).bodyid[0] for p in points}
+        tips = {robot.model.geom(name).bodyid[0] for name in _round_tips(robot)}
         for name in bodies:
             if robot.model.body(name).id not in tips:
                 spec.add_exclude(bodyname1=name, bodyname2=OBJECT)

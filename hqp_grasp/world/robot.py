@@ -364,7 +364,13 @@ class Robot:
 
     def tip_frames(self, q: np.ndarray) -> np.ndarray:
         """R_world_tip of the contact points' sites (k, 3, 3), in which their sensors read."""
-        return self._at(q).site_xmat[self._sites].reshape(-1, 3, 3)
+        sites = [self.model.site(point.site).id for point in self.description.contact_points]
+        return self._at(q).site_xmat[sites].reshape(-1, 3, 3)
+
+    @property
+    def palm_body(self) -> int:
+        """The link that is the palm."""
+        return self._palm[0]
 
     def palm(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the palm is, p_palm (3,) [m] and R_world_palm (3, 3), world.
