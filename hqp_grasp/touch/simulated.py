@@ -15,6 +15,7 @@ from hqp_grasp.touch.driver import DriverLimits, Readings
 from hqp_grasp.touch.geometric import OVERLAP, RETREAT
 from hqp_grasp.touch.imperfections import Imperfections, SensorErrors
 from hqp_grasp.world.objects import OBJECT
+from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
 # How a contact yields: solref and solimp of the object's geom.
