@@ -24,8 +24,9 @@ BOUNDS := $(PY) -c 'import tomllib; \
   print(*("{}=={}".format(*each.split(">=")) for each in needed), sep="\n")'
 
 unexport PYTHONPATH PYTHONHOME
+export NO_MKDOCS_2_WARNING := 1  # mkdocs-material's notice; pyproject.toml holds mkdocs below 2
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-oldest lint docs bench mutants results clean
+.PHONY: help demo test test-all test-oldest lint docs pictures bench mutants results clean
 .NOTPARALLEL:
 
 help:
@@ -35,6 +36,7 @@ help:
 	@echo 'make test-oldest   run the tests with the oldest dependencies admitted, in .venv-oldest'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make docs    build the site into site/'
+	@echo 'make pictures   draw the laws and the grasp on the front page into docs/ (needs chromium)'
 	@echo 'make bench   compare with peers, print ratios'
 	@echo 'make mutants   spoil the code in 28 places, see whether tests notice (an hour)'
 	@echo 'make results   run all that README and docs quote, into out/results and docs/images (an hour)'
@@ -62,6 +64,9 @@ lint: $(READY_DEV)
 docs: $(READY_DEV)
 	$(PY) -m mkdocs build --strict
 
+pictures: $(READY_ALL)
+	$(PY) docs/pictures.py
+
 bench: $(READY_BENCH)
 	@set -e; for file in $(filter-out benchmarks/mutants.py,$(wildcard benchmarks/*.py)); do \
 	  echo "$$file"; $(PY) "$$file"; done
@@ -75,7 +80,7 @@ RESULTS := out/results
 keep = $(PY) $(2) > $(RESULTS)/$(1).txt
 study = $(PY) scenarios/$(1).py --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
 
-results: $(READY_BENCH)
+results: $(READY_BENCH) pictures
 	rm -rf $(RESULTS)
 	mkdir -p $(RESULTS)
 	$(call study,cylinder)

@@ -18,10 +18,13 @@ EXAMPLES = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page 
 SHOWN_ON = [
     "CONTRIBUTING.md",
     "README.md",
+    "index.md",
     "looking.md",
     "mink.md",
     "objects.md",
+    "only-solver.md",
     "own-hand.md",
+    "own-law.md",
     "quickstart.md",
     "real-hand.md",
     "solver.md",
