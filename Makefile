@@ -65,6 +65,7 @@ docs: $(READY_DEV)
 	$(PY) -m mkdocs build --strict
 
 pictures: $(READY_ALL)
+	$(PY) docs/drawings.py
 	$(PY) docs/pictures.py
 
 bench: $(READY_BENCH)

@@ -1,9 +1,4 @@
-"""The pictures of these pages that no study makes: `make pictures`.
-
-- replay.html, the grasp on the front page that one can turn, and images/grasp.png, the same as a
-  picture (this one needs chromium);
-- images/law-*.svg, the laws as drawings, for light and for dark pages.
-"""
+"""The grasp on the front page, as replay.html and as images/grasp.png: `make pictures`."""
 
 import shutil
 from pathlib import Path
