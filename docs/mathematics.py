@@ -7,8 +7,10 @@ from typing import Any
 from latex2mathml.converter import convert
 from mkdocs.exceptions import PluginError
 
-# latex2mathml lets bars grow with what follows them, on one side only.
-BAR = re.compile(r"<mo>(&#x0007C;|&#x02016;)</mo>")
+# What latex2mathml leaves to browsers, and they get wrong: bars that grow on one side, room around
+# bars and strokes, a dot far above its letter.
+BAR = re.compile(r"<mo(?: stretchy=\"false\")?>(&#x0007C;|&#x02016;|&#x0002F;)</mo>")
+DOT = re.compile(r"<mover>(<mi>[^<]*</mi><mo>&#x002D9;</mo></mover>)")
 # What pymdownx.arithmatex leaves of $…$ and of $$…$$.
 FOUND = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -22,7 +24,8 @@ def on_page_content(content: str, page: Any, **_: Any) -> str:
         made = convert(latex, display=display)
         if "\\" in made:  # a command unknown to latex2mathml comes out as it went in
             raise PluginError(f"{page.file.src_uri}: no MathML for {latex}: {made}")
-        made = BAR.sub(r'<mo stretchy="false">\1</mo>', made)
+        made = BAR.sub(r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>', made)
+        made = DOT.sub(r'<mover accent="true">\1', made)
         return f'<div class="equation">{made}</div>' if display == "block" else made
 
     return FOUND.sub(mathml, content)

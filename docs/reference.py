@@ -57,7 +57,7 @@ class Fields(griffe.Extension):
         """griffe calls this with every class, once its members are there."""
         fields = []
         for name, member in cls.members.items():
-            if member.is_attribute and not name.startswith("_") and member.lineno:
+            if "property" not in member.labels and member.is_attribute and name[0] != "_":
                 _, _, meaning = member.lines[0].partition(BESIDE)
                 if not meaning and any("Enum" in str(base) for base in cls.bases):
                     meaning = str(member.value).strip("\"'")

@@ -3,6 +3,10 @@
 import contextlib
 import io
 import re
+import runpy
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,10 +16,13 @@ from hqp_grasp.experiments.study import STUDY_COLUMNS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-# A block of Python, and the block of text that stands right below it where there is one.
-BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
-EXAMPLES = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page in PAGES}
-SHOWN_ON = [
+# A fenced block, the name of the file where it is one, and the block of text right below it.
+BLOCK = re.compile(
+    r"^```(python|sh|text)(?: title=\"(.+?)\")?\n(.*?)^```\n(?:\n```text\n(.*?)^```)?",
+    re.DOTALL | re.MULTILINE,
+)
+BLOCKS = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page in PAGES}
+PYTHON_ON = [
     "CONTRIBUTING.md",
     "README.md",
     "index.md",
@@ -29,24 +36,80 @@ SHOWN_ON = [
     "real-hand.md",
     "solver.md",
 ]
+COMMANDS_ON = ["looking.md", "objects.md", "quickstart.md", "results.md"]
+SMALL = ["--trials", "8", "--probes", "2", "--jobs", "1"]  # in the place of what the page says
+ELSEWHERE = ("benchmarks/", "pytest", "ruff")  # what `make results`, `make test` run
+
+
+def commands(script):
+    """The command lines of a block, in words; comments are left out."""
+    lines = (shlex.split(line, comments=True) for line in script.splitlines())
+    return [words for words in lines if words]
+
+
+def calls(page):
+    """The page's calls of hqp_grasp and of scenarios, each by its arguments after `python`."""
+    found = [w for kind, _, code, _ in BLOCKS[page] if kind == "sh" for w in commands(code)]
+    python = [w[1:] for w in found if w[0] in ("python", ".venv/bin/python")]
+    return [w for w in python if not any(part in " ".join(w[:2]) for part in ELSEWHERE)]
+
+
+def call(arguments, monkeypatch):
+    """Do in this process what `python ARGUMENTS` does, with few and short trials."""
+    if arguments[0] == "-m":
+        module, arguments = arguments[1], arguments[2:]
+    else:
+        module = "hqp_grasp." + arguments[0].removesuffix(".py").replace("/", ".")
+        arguments = arguments[1:]
+    if module != "hqp_grasp" or arguments[0] == "run":
+        arguments = [*arguments, *SMALL]
+    elif arguments[0] == "view":
+        arguments = [*arguments, "--port", "0"]
+    monkeypatch.setattr(sys, "argv", [module, *arguments])
+    runpy.run_module(module, run_name="__main__")
+
+
+def interrupted(viewer):
+    raise KeyboardInterrupt
 
 
 def test_the_pages_that_show_code_are_all_found():
-    assert sorted(page for page, blocks in EXAMPLES.items() if blocks) == SHOWN_ON
+    with_python = [page for page in BLOCKS if any(b[0] == "python" for b in BLOCKS[page])]
+    assert sorted(with_python) == PYTHON_ON
+    assert sorted(page for page in BLOCKS if calls(page)) == COMMANDS_ON
 
 
-@pytest.mark.parametrize("page", SHOWN_ON)
-def test_examples_run_and_print_what_the_page_shows(page, tmp_path, monkeypatch):
+@pytest.mark.parametrize("page", sorted({*PYTHON_ON, *COMMANDS_ON}))
+def test_what_a_page_shows_runs_and_prints_what_the_page_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if page == "looking.md":
         pytest.importorskip("viser", reason="the page is about the extra hqp_grasp[view]")
+        monkeypatch.setattr("hqp_grasp.experiments.view.Viewer.play", interrupted)
     names = {"__name__": "__main__"}  # a page's later blocks go on from its earlier ones
-    for code, shown in EXAMPLES[page]:
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            exec(compile(code, page, "exec"), names)
-        if shown:
-            assert printed.getvalue() == shown
+    for kind, file, code, shown in BLOCKS[page]:
+        if file:
+            Path(file).write_text(code, encoding="utf-8")
+        elif kind == "python":
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
+                exec(compile(code, page, "exec"), names)
+            if shown:
+                assert printed.getvalue() == shown
+    for arguments in calls(page):
+        call(arguments, monkeypatch)
+
+
+@pytest.mark.parametrize("page", BLOCKS)
+def test_make_knows_what_a_page_has_it_make(page):
+    found = [w for kind, _, code, _ in BLOCKS[page] if kind == "sh" for w in commands(code)]
+    for words in found:
+        if words[0] == "make":
+            subprocess.run([*words, "--dry-run"], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_nothing_else_than_python_and_make_is_shown_as_a_command():
+    found = [w for p in BLOCKS for k, _, code, _ in BLOCKS[p] if k == "sh" for w in commands(code)]
+    assert {words[0] for words in found} <= {"make", "python", ".venv/bin/python"}
 
 
 def test_the_quickstart_lists_every_column_of_the_results_in_their_order():
