@@ -36,8 +36,8 @@ PYTHON_ON = [
     "real-hand.md",
     "solver.md",
 ]
-COMMANDS_ON = ["looking.md", "objects.md", "quickstart.md", "results.md"]
-SMALL = ["--trials", "8", "--probes", "2", "--jobs", "1"]  # in the place of what the page says
+COMMANDS_ON = ["looking.md", "objects.md", "quickstart.md", "real-hand.md", "results.md"]
+SMALL = ["--probes", "2", "--jobs", "1"]  # in the place of what the page says, and so few trials
 ELSEWHERE = ("benchmarks/", "pytest", "ruff")  # what `make results`, `make test` run
 
 
@@ -62,10 +62,13 @@ def call(arguments, monkeypatch):
         module = "hqp_grasp." + arguments[0].removesuffix(".py").replace("/", ".")
         arguments = arguments[1:]
     if module != "hqp_grasp" or arguments[0] == "run":
-        arguments = [*arguments, *SMALL]
+        trials = "8" if "--replay" in arguments else "2"
+        arguments = [*arguments, *SMALL, "--trials", trials]
     elif arguments[0] == "view":
         arguments = [*arguments, "--port", "0"]
     monkeypatch.setattr(sys, "argv", [module, *arguments])
+    for name in [name for name in sys.modules if name.startswith("hqp_grasp.scenarios.")]:
+        monkeypatch.delitem(sys.modules, name)  # a command starts afresh
     runpy.run_module(module, run_name="__main__")
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import io
-import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -329,13 +326,3 @@ def test_nothing_asked_is_answered_by_standing_still(world):
     for given in ({}, {"limits": world.limits}, {"limits": []}):
         assert np.abs(solve_ik(configuration, [[]], DT, **given)).max() < EXACT
     assert np.abs(solve_ik(configuration, [], DT)).max() < EXACT
-
-
-def test_the_page_on_mink_runs_and_prints_what_it_shows():
-    page = (ROOT / "docs" / "mink.md").read_text()
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
-    shown = re.findall(r"```text\n(.*?)```", page, re.DOTALL)[1:]  # the first is mink's call
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        exec(compile(code, "docs/mink.md", "exec"), {})
-    assert printed.getvalue() == "".join(shown)
