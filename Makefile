@@ -32,7 +32,7 @@ export NO_MKDOCS_2_WARNING := 1  # mkdocs-material's notice; pyproject.toml hold
 help:
 	@echo 'make demo    run the cylinder scenario; table on screen, results in out/cylinder'
 	@echo 'make test    lint, check types, run the tests, build the docs strictly'
-	@echo 'make test-all    the same, then the slow tests, which drive a browser (chromium)'
+	@echo 'make test-all    the same, then the slow tests, which drive a browser (chromium) and a Dask cluster'
 	@echo 'make test-oldest   run the tests with the oldest dependencies admitted, in .venv-oldest'
 	@echo 'make lint    ruff and mypy only'
 	@echo 'make docs    build the site into site/'
@@ -51,7 +51,7 @@ test: lint $(READY_DEV)
 	$(PY) -m mkdocs build --strict --quiet
 
 test-all: test $(READY_ALL)
-	$(PY) -m pytest $(PYTEST_ARGS) -m browser
+	$(PY) -m pytest $(PYTEST_ARGS) -m "browser or cluster"
 
 test-oldest: $(READY_OLDEST)
 	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest $(PYTEST_ARGS)
@@ -137,13 +137,13 @@ $(READY): pyproject.toml $(MADE)
 
 $(READY_DEV): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and its tools into $(VENV) (once)'
-	@$(PIP) --editable '.[view,test,dev,docs]'
+	@$(PIP) --editable '.[view,cluster,read,test,dev,docs]'
 	@$(COMPILE)
 	@touch $(READY) $@
 
 $(READY_ALL): pyproject.toml $(MADE)
 	@echo 'Installing what drives a browser into $(VENV) (once)'
-	@$(PIP) --editable '.[view,test,dev,docs,browser]'
+	@$(PIP) --editable '.[view,cluster,read,test,dev,docs,browser]'
 	@touch $(READY) $(READY_DEV) $@
 
 $(READY_OLDEST): pyproject.toml $(MADE)

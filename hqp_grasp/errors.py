@@ -23,6 +23,10 @@ class ResultsError(HqpGraspError, OSError):
     """A results folder cannot be written, or belongs to another configuration."""
 
 
+class WorkerError(HqpGraspError, RuntimeError):
+    """The processes or the cluster of a study cannot do its work, or are gone."""
+
+
 class ReachError(HqpGraspError, RuntimeError):
     """No starting posture touches the object: it is out of the hand's reach."""
 

@@ -8,17 +8,19 @@ import hashlib
 import importlib.util
 import inspect
 import math
+import platform
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType
 
+import llvmlite.binding
 import mink
 import mujoco
 import numpy as np
@@ -142,6 +144,12 @@ class Fingerprint:
             reason = f"{part.__qualname__} ({at}) {why}"
             if reason not in self.unknown:
                 self.unknown.append(reason)
+
+
+@cache
+def cpu_kind() -> str:
+    """The kind of this machine's processor, as the compiler of the solver names it."""
+    return f"{platform.machine()} {llvmlite.binding.get_host_cpu_name()}"
 
 
 def differences(there: object, here: object, at: str = "") -> Iterator[str]:

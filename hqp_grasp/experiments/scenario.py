@@ -27,7 +27,7 @@ from hqp_grasp.tasks import Stack, stack_of
 from hqp_grasp.world.scene import Scene
 
 # Settings that no trial reads.
-ABOUT_THE_RUN = {"trials", "seed", "jobs", "out", "strict", "replay", "view", "port"}
+ABOUT_THE_RUN = {"trials", "seed", "jobs", "cluster", "out", "strict", "replay", "view", "port"}
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ class Settings:
     """Trial i draws from SeedSequence([seed, i])."""
     jobs: int = 2
     """Processes."""
+    cluster: str | None = None
+    """Run on a Dask cluster instead: the address of its scheduler, tcp://host:8786, or its
+    scheduler file."""
     out: Path | None = None
     """Results folder; a rerun continues it. Default: out/SCENARIO-STACK-FORM."""
     strict: bool = False
@@ -140,7 +143,9 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
     scene = settings.scene(scene)
     trial = trial_of(scene, settings)
     out = _out(name, settings)
-    study = Study(trial, settings.trials, settings.seed, settings.jobs, settings.strict)
+    study = Study(
+        trial, settings.trials, settings.seed, settings.jobs, settings.strict, settings.cluster
+    )
     if not 0 <= settings.replay < settings.trials:
         raise InputError(
             f"--replay takes a trial, 0 … {settings.trials - 1}; got {settings.replay}"

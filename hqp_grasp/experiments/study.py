@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Generator, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from hqp_grasp.errors import InputError, ResultsError, TrialError
-from hqp_grasp.experiments.fingerprint import Fingerprint, differences
+from hqp_grasp.errors import InputError, ResultsError, TrialError, WorkerError
+from hqp_grasp.experiments.executor import DEATHS, address_of, run_all, tell
+from hqp_grasp.experiments.fingerprint import Fingerprint, cpu_kind, differences
+from hqp_grasp.experiments.parts import Parts
 from hqp_grasp.experiments.record import Record
 from hqp_grasp.experiments.trial import Trial
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
 
 STUDY_COLUMNS = {
     "trial": "number of the trial",
     "seed": "trial i draws from SeedSequence([seed, i])",
+    "cpu": "kind of processor that ran the trial: bits are the same on one kind",
 }
 
 
@@ -34,14 +33,18 @@ STUDY_COLUMNS = {
 class Study:
     """`trials` runs of one trial; trial i draws from SeedSequence([seed, i]).
 
-    DIR/parts/ holds one file a trial, written whole or not at all; DIR/probes.parquet is all of
-    them. DIR/config.json says what was run: a folder is continued with the same configuration and
-    refused with another, or where parts of it cannot be compared (see Fingerprint). Raises
-    ResultsError, before any work, for a folder that cannot be written or continued.
+    They run in `jobs` processes, or on the Dask `cluster` whose scheduler has this address, or
+    wrote this file: workers return rows, this process writes them. DIR/parts/ holds finished
+    trials, each written whole or not at all; DIR/probes.parquet is all of them. DIR/config.json
+    says what was run: a folder is continued with the same configuration and refused with another,
+    or where parts of it cannot be compared (see Fingerprint). Raises ResultsError, before any work,
+    for a folder that cannot be written or continued; WorkerError where the workers cannot do the
+    work or are gone: what is done is on disk.
 
     A trial that ends in an error keeps its rows so far, and says why in its column `error`; a rerun
-    tries it again, and `trial.run((seed, i))` raises that error. With `strict` the study stops at
-    the first one: what is done is on disk, then TrialError is raised.
+    tries it again, and `trial.run((seed, i))` raises that error. One whose worker dies runs again,
+    and has that for its error where it happens every time. With `strict` the study stops at the
+    first one: what is done is on disk, then TrialError is raised.
     """
 
     trial: Trial
@@ -49,102 +52,93 @@ class Study:
     seed: int = 0
     jobs: int = 1
     strict: bool = False
+    cluster: str | Path | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("trials", 1), ("seed", 0), ("jobs", 1)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} must be at least {least}; got {getattr(self, name)}")
+        if self.cluster is not None:
+            address_of(self.cluster)
 
     def configuration(self) -> dict[str, object]:
         """What fixes every figure of the study, timings aside; the number of trials does not."""
         found = Fingerprint(self.trial)
         return {"seed": self.seed, **found.parts, "unknown": found.unknown}
 
-    def run(self, out: str | Path) -> pa.Table:
+    def run(self, out: str | Path, columns: Sequence[str] | None = None) -> pa.Table:
         """Run what is missing or failed in `out`, and return the rows of these `trials`.
 
-        DIR/probes.parquet keeps further trials too, where the folder has them.
+        All their columns, or these: 100,000 trials of 40 probes hold 2 GB. DIR/probes.parquet keeps
+        further trials too, where the folder has them.
         """
-        out = Path(out)
-        parts = _claim(out, self.configuration())
-        self.trial.scene.save(out / "scene.json")  # for whoever draws it
-        missing = [i for i in range(self.trials) if not _is_done(_part(parts, i))]
-        bar = tqdm(total=self.trials, initial=self.trials - len(missing), unit="trial", ncols=80)
-        failed: TrialError | None = None
-        with bar, closing(self._run_missing(missing, parts)) as running:
-            for i, error in running:
-                bar.update()
-                if self.strict and error is not None:
-                    failed = TrialError(f"trial {i} of seed {self.seed} ended by {error}", i)
-                    break
-        table = _merge(parts, out / "probes.parquet")
+        out, whole = Path(out), Path(out) / "probes.parquet"
+        with _claimed(out, self.configuration()) as folder:
+            self.trial.scene.save(out / "scene.json")  # for whoever draws it
+            parts = Parts(folder)
+            for name in parts.broken:
+                tell(f"{folder / name} cannot be read: set aside, and what was in it runs again")
+            failed = self._run_missing(parts, out)
+            parts.merge(whole)
         if failed is not None:
             raise failed
-        numbers = table.column("trial").to_numpy()
-        return table.filter(pa.array(numbers < self.trials))
+        return pq.read_table(whole, columns=columns, filters=[("trial", "<", self.trials)])
 
-    def _run_missing(
-        self, missing: list[int], parts: Path
-    ) -> Generator[tuple[int, str | None], None, None]:
-        """Run these; yield each one's number, and what ended it."""
-        if self.jobs == 1 or len(missing) < 2:
-            for i in missing:
-                yield i, _run_one(self.trial, self.seed, i, parts)
-            return
-        with (
-            _one_blas_thread(),
-            ProcessPoolExecutor(self.jobs, mp_context=get_context("spawn")) as pool,
-        ):
-            futures = {pool.submit(_run_one, self.trial, self.seed, i, parts): i for i in missing}
+    def _run_missing(self, parts: Parts, out: Path) -> TrialError | None:
+        """Run what is not done; return what ended a strict study, if anything did."""
+        missing = [i for i in range(self.trials) if not parts.is_done(i)]
+        bar = tqdm(total=self.trials, initial=self.trials - len(missing), unit="trial", ncols=80)
+        work = _Work(self.trial, self.seed)
+        with bar, closing(run_all(work, missing, self.jobs, self.cluster)) as running:
             try:
-                for future in as_completed(futures):
-                    yield futures[future], future.result()
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+                for i, table in running:
+                    if table is None:
+                        table = _table(self._died(i), i, self.seed)
+                    parts.add(i, table)
+                    bar.update()
+                    error = table["error"][0].as_py()
+                    if self.strict and error is not None:
+                        return TrialError(f"trial {i} of seed {self.seed} ended by {error}", i)
+            except WorkerError as error:
+                raise WorkerError(
+                    f"{error}; {len(parts)} trials are in {out}, and the same command continues"
+                ) from error
+        return None
+
+    def _died(self, i: int) -> Record:
+        why = f"WorkerError: its process died each time, {DEATHS} times alone"
+        return self.trial.nothing((self.seed, i), why)
 
 
-def _run_one(trial: Trial, seed: int, i: int, parts: Path) -> str | None:
-    """Run trial i and write it down; return what ended it, if anything did."""
-    record = trial.attempt((seed, i))
-    _write(_table(record, i, seed), _part(parts, i))
-    return record.error
+@dataclass(frozen=True)
+class _Work:
+    """What workers do."""
+
+    trial: Trial
+    seed: int
+
+    def __call__(self, i: int) -> pa.Table:
+        return _run_one(self.trial, self.seed, i)
+
+
+def _run_one(trial: Trial, seed: int, i: int) -> pa.Table:
+    """The rows of trial i."""
+    return _table(trial.attempt((seed, i)), i, seed)
 
 
 def _table(record: Record, trial: int, seed: int) -> pa.Table:
     """The record's table, and which trial of the study it is."""
     table = record.to_table()
-    for at, (name, value) in enumerate({"trial": trial, "seed": seed}.items()):
-        about = pa.field(name, pa.int64(), metadata={"meaning": STUDY_COLUMNS[name]})
-        table = table.add_column(at, about, pa.array([value] * len(record.rows), pa.int64()))
+    for at, (name, value) in enumerate({"trial": trial, "seed": seed, "cpu": cpu_kind()}.items()):
+        kind = pa.string() if isinstance(value, str) else pa.int64()
+        about = pa.field(name, kind, metadata={"meaning": STUDY_COLUMNS[name]})
+        table = table.add_column(at, about, pa.array([value] * len(record.rows), kind))
     return table
 
 
-def _is_done(part: Path) -> bool:
-    """True where the trial has run, and no error ended it."""
-    return part.exists() and pq.read_table(part, columns=["error"])["error"].null_count > 0
-
-
-def _merge(parts: Path, whole: Path) -> pa.Table:
-    """All trials of the folder, in order."""
-    table = pa.concat_tables([pq.read_table(part) for part in sorted(parts.glob("*.parquet"))])
-    _write(table, whole)
-    return table
-
-
-def _part(parts: Path, i: int) -> Path:
-    return parts / f"trial_{i:06d}.parquet"
-
-
-def _write(table: pa.Table, path: Path) -> None:
-    """Write the whole file, or nothing."""
-    part = path.with_suffix(f".{os.getpid()}.part")
-    pq.write_table(table, part)
-    part.replace(path)
-
-
-def _claim(out: Path, configuration: dict[str, object]) -> Path:
-    """Make sure that `out` can be written and is ours; return its parts folder."""
+@contextmanager
+def _claimed(out: Path, configuration: dict[str, object]) -> Iterator[Path]:
+    """The parts folder of `out`, which can be written, is of this configuration, and only ours."""
     parts = out / "parts"
     try:
         parts.mkdir(parents=True, exist_ok=True)
@@ -154,14 +148,33 @@ def _claim(out: Path, configuration: dict[str, object]) -> Path:
         raise ResultsError(f"{out} cannot be written: {error.strerror or error}") from error
     config = out / "config.json"
     if config.exists():
-        _compare(out, json.loads(config.read_text()), configuration)
+        _compare(out, _described(config), configuration)
     elif any(parts.iterdir()):
         raise ResultsError(f"{out} holds results without a config.json; take another folder")
     else:
         fresh = config.with_suffix(f".{os.getpid()}.part")
         fresh.write_text(json.dumps(configuration, indent=2) + "\n")
         fresh.replace(config)
-    return parts
+    with config.open() as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ResultsError(
+                f"{out} is being written by another run; wait until it ends"
+            ) from None
+        except OSError as error:
+            raise ResultsError(f"{config} cannot be locked: {error.strerror or error}") from error
+        yield parts
+
+
+def _described(config: Path) -> dict[str, object]:
+    try:
+        return json.loads(config.read_text())
+    except ValueError as error:
+        raise ResultsError(
+            f"{config} cannot be read, so whose results these are cannot be told ({error}); "
+            "take another --out"
+        ) from error
 
 
 def _compare(out: Path, there: dict[str, object], here: dict[str, object]) -> None:
@@ -179,18 +192,3 @@ def _compare(out: Path, there: dict[str, object], here: dict[str, object]) -> No
             f"{out} has results, and whether they are of this configuration cannot be told: "
             f"{unknown[0]}; {way_out}"
         )
-
-
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Workers inherit the environment: one thread each, so that they do not crowd the cores."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

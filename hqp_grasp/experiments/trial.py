@@ -95,6 +95,11 @@ class Trial:
         """`run`, but a failure on the way becomes `Record.error`: rows so far are kept."""
         return self._run(seed, probe)[0]
 
+    def nothing(self, seed: int | Sequence[int], error: str) -> Record:
+        """The record of a trial of which nothing is known but what ended it."""
+        rows = (empty_row(self.scene.articulated, Stack.of(self.stack)),) * (self.probes + 1)
+        return Record(_entropy(seed), rows, (), 0, self.scene.articulated.joints, error)
+
     def _run(
         self, seed: int | Sequence[int], probe: Probe | None
     ) -> tuple[Record, Exception | None]:

@@ -184,7 +184,7 @@ def test_a_data_frame_has_a_row_for_every_probe(record):
     pytest.importorskip("pandas")
     frame = record.to_pandas()
     assert len(frame) == PROBES + 1
-    assert frame["error_height"].tolist() == record.column("error_height").tolist()
+    np.testing.assert_array_equal(frame["error_height"], record.column("error_height"))
 
 
 def test_a_record_is_printed_in_one_short_line(record):

@@ -12,7 +12,7 @@ from own_law import ManyThreadsTask, OneThreadTask
 
 from hqp_grasp.control.controller import Controller
 from hqp_grasp.errors import InputError, ResultsError, SolverError, TrialError
-from hqp_grasp.experiments import fingerprint
+from hqp_grasp.experiments import executor, fingerprint
 from hqp_grasp.experiments import study as module
 from hqp_grasp.experiments.record import COLUMNS, empty_row
 from hqp_grasp.experiments.study import Study
@@ -26,6 +26,7 @@ TIMINGS = ["solve_us"]
 CONTRACT = {
     "trial": ("int64", None),
     "seed": ("int64", None),
+    "cpu": ("string", None),
     "probe": ("int64", None),
     "eps_f": ("double", "N^2"),
     "eps_m": ("double", "(N m)^2"),
@@ -70,9 +71,9 @@ def ran(monkeypatch):
     numbers = []
     run_one = module._run_one
 
-    def counted(trial, seed, i, parts):
+    def counted(trial, seed, i):
         numbers.append(i)
-        return run_one(trial, seed, i, parts)
+        return run_one(trial, seed, i)
 
     monkeypatch.setattr(module, "_run_one", counted)
     return numbers
@@ -203,10 +204,10 @@ def test_a_file_half_written_by_a_killed_run_is_ignored(done, study, folder, ran
 def test_an_interrupted_study_keeps_its_complete_trials(monkeypatch, done, study, tmp_path):
     out, run_one = tmp_path / "results", module._run_one
 
-    def interrupted(trial, seed, i, parts):
+    def interrupted(trial, seed, i):
         if i == 1:
             raise KeyboardInterrupt
-        return run_one(trial, seed, i, parts)
+        return run_one(trial, seed, i)
 
     monkeypatch.setattr(module, "_run_one", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -220,18 +221,17 @@ def test_an_interrupted_study_keeps_its_complete_trials(monkeypatch, done, study
 def test_an_interrupt_while_writing_leaves_no_broken_trial(monkeypatch, done, study, folder):
     part = folder / "parts" / "trial_000000.parquet"
     part.unlink()
-    write_table = pq.write_table
+    write_table = pq.ParquetWriter.write_table
 
-    def torn(table, path):
-        write_table(table, path)
-        path.write_bytes(path.read_bytes()[:50])
+    def torn(writer, table):
+        write_table(writer, table)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pq, "write_table", torn)
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", torn)
     with pytest.raises(KeyboardInterrupt):
         study.run(folder)
     assert not part.exists()
-    monkeypatch.setattr(pq, "write_table", write_table)
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", write_table)
     assert same(study.run(folder), done[1])
 
 
@@ -268,7 +268,7 @@ def test_a_failing_trial_is_recorded_and_the_others_go_on(done, study, tmp_path,
         else:
             assert row["in_contact"] is False
             told = {name for name, value in row.items() if value not in (None, False, 0.0, "")}
-            assert told <= {"trial", "seed", "probe", "rejected", "error"}
+            assert told <= {"trial", "seed", "cpu", "probe", "rejected", "error"}
 
 
 def test_a_rerun_tries_failed_trials_again_and_no_others(done, study, tmp_path, failing, ran):
@@ -316,12 +316,12 @@ def test_a_strict_study_stops_in_several_processes_too(trial, tmp_path):
 
 
 def test_every_worker_has_one_blas_thread(trial, tmp_path, monkeypatch):
-    for name in module.THREADS:
+    for name in executor.THREADS:
         monkeypatch.delenv(name, raising=False)
     one = dataclasses.replace(trial, stack=OneThreadTask(), probes=1)
     table = Study(one, 2, SEED, jobs=2).run(tmp_path / "results")
     assert table.column("error").null_count == table.num_rows
-    assert not any(name in os.environ for name in module.THREADS)
+    assert not any(name in os.environ for name in executor.THREADS)
 
 
 # ---------------------------------------------------------------- refusals

@@ -1,0 +1,320 @@
+"""Where work is done: in this process, in processes of this machine, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import sys
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import CancelledError, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from time import monotonic
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
+from hqp_grasp.experiments.fingerprint import Fingerprint, differences
+
+T = TypeVar("T")
+Done = Generator[tuple[int, T | None], None, None]
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+IN_FLIGHT = 2  # numbers given to each worker at a time: the next one waits where it will run
+DEATHS = 3  # times that a number alone may cost its process before it is given up
+ANSWER = 6.0  # [s] within which a scheduler must answer at first
+ASK = 4.0  # [s] between questions to the scheduler, whether it is still there
+ALIVE = 10.0  # [s] within which it must answer them
+SILENT = 20.0  # [s] after which a connection without an answer counts as broken
+WORKERS = 300.0  # [s] to wait for a worker: a queue may have to start one
+
+
+def run_all(
+    work: Callable[[int], T],
+    numbers: Sequence[int],
+    jobs: int = 1,
+    cluster: str | Path | None = None,
+) -> Done[T]:
+    """Yield each number with work(number) as it is done; None where it costs every process.
+
+    In `jobs` processes of this machine, or on the Dask cluster whose scheduler has the address, or
+    wrote the file, `cluster`. A few numbers a worker are under way at any time. One whose process
+    dies is done again; one that brings down every process is given up. Raises WorkerError where
+    there is nobody to do the work, or not the same software.
+    """
+    if cluster is not None:
+        return _on_cluster(work, numbers, address_of(cluster))
+    if jobs == 1 or len(numbers) < 2:
+        return ((i, work(i)) for i in numbers)
+    return _in_processes(work, numbers, jobs)
+
+
+# ---------------------------------------------------------------- processes of this machine
+
+
+def _in_processes(work: Callable[[int], T], numbers: Sequence[int], jobs: int) -> Done[T]:
+    waiting = deque(numbers)
+    worked = False
+    with _one_blas_thread():
+        while waiting:
+            suspects: list[int] = []  # under way when a process died
+            for i, result in _in_pool(work, waiting, jobs, suspects):
+                worked = True
+                yield i, result
+            given_up = []
+            for i in suspects:
+                for _ in range(DEATHS):
+                    died: list[int] = []
+                    for _, result in _in_pool(work, deque([i]), 1, died):
+                        worked = True
+                        yield i, result
+                    if not died:
+                        break
+                else:
+                    given_up.append(i)
+            if given_up and not worked:
+                raise WorkerError(
+                    "every process died before it had done anything: out of memory? A script that "
+                    'runs a study in several processes needs `if __name__ == "__main__":`'
+                )
+            yield from ((i, None) for i in given_up)
+
+
+def _in_pool(
+    work: Callable[[int], T], waiting: deque[int], jobs: int, suspects: list[int]
+) -> Generator[tuple[int, T], None, None]:
+    """Work until nothing is waiting, or a process dies: `suspects` are then those under way."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        under_way: dict[Any, int] = {}
+        try:
+            while under_way or (waiting and not suspects):
+                while waiting and not suspects and len(under_way) < IN_FLIGHT * jobs:
+                    try:
+                        under_way[pool.submit(work, waiting[0])] = waiting[0]
+                    except BrokenProcessPool:
+                        break
+                    waiting.popleft()
+                if not under_way:
+                    return
+                for future in wait(under_way, return_when="FIRST_COMPLETED").done:
+                    i = under_way.pop(future)
+                    if isinstance(future.exception(), BrokenProcessPool):
+                        suspects.append(i)
+                    else:
+                        yield i, future.result()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Workers inherit the environment: one thread each, so that they do not crowd the cores."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+# ---------------------------------------------------------------- a Dask cluster
+
+
+def address_of(cluster: str | Path) -> str:
+    """The scheduler's address: as it stands, or as the scheduler wrote it into a file."""
+    text, path = str(cluster), Path(cluster)
+    if path.is_file():
+        try:
+            return str(json.loads(path.read_text())["address"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{path} is no scheduler file, as `dask scheduler --scheduler-file {path}` writes "
+                f"it: {type(error).__name__}: {error}"
+            ) from error
+    if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+", text):
+        raise InputError(
+            "a cluster is the address of a Dask scheduler, tcp://host:8786, or the file which "
+            f"`dask scheduler --scheduler-file FILE` writes; there is no file {text!r}"
+        )
+    return text
+
+
+def _on_cluster(work: Callable[[int], T], numbers: Sequence[int], address: str) -> Done[T]:
+    with _Cluster(work, address) as cluster:
+        suspects = yield from cluster.run(numbers)
+        for i in suspects:  # others may have been to blame
+            for number in (yield from cluster.run([i])):
+                yield number, None
+
+
+class _Cluster:
+    """A connection to a scheduler, over which one kind of work is done."""
+
+    def __init__(self, work: Callable[[int], Any], address: str) -> None:
+        self._dask = need("dask")
+        self._distributed = need("distributed")
+        self._address = address
+        self._expected = json.dumps(Fingerprint(work).parts)
+        self._payload = importlib.import_module("cloudpickle").dumps(work)
+
+    def __enter__(self) -> _Cluster:
+        # Dask's own would wait 30 s each.
+        self._patience = self._dask.config.set(
+            {
+                "distributed.comm.timeouts.connect": f"{ANSWER}s",
+                "distributed.comm.timeouts.tcp": f"{SILENT}s",
+            }
+        )
+        try:
+            self._client = self._distributed.Client(
+                self._address, timeout=ANSWER, set_as_default=False, name="hqp_grasp"
+            )
+        except (OSError, ValueError, ImportError) as error:
+            self._patience.__exit__(None, None, None)
+            raise WorkerError(
+                f"no Dask scheduler answers at {self._address} within {ANSWER:g} s ({error}); "
+                "start one with `dask scheduler`, and workers with `dask worker`"
+            ) from error
+        self._workers_seen = monotonic()
+        self._told = False
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close(timeout=2.0)
+        self._patience.__exit__(None, None, None)
+
+    def run(self, numbers: Sequence[int]) -> Generator[tuple[int, Any], None, list[int]]:
+        """Yield each number with its result; return those whose workers died, again and again."""
+        waiting, suspects = deque(numbers), []
+        under_way: dict[str, tuple[int, Any]] = {}
+        done: SimpleQueue[Any] = SimpleQueue()
+        token, asked, width = uuid.uuid4().hex, -ASK, 0
+        while waiting or under_way:
+            if monotonic() - asked >= ASK:
+                width, asked = max(1, IN_FLIGHT * self._threads()), monotonic()
+            while waiting and len(under_way) < width:
+                i = waiting.popleft()
+                future = self._client.submit(
+                    _do, self._payload, self._expected, i, key=f"hqp_grasp-{token}-{i}"
+                )
+                under_way[future.key] = (i, future)
+                future.add_done_callback(done.put)
+            try:
+                future = done.get(timeout=ASK)
+            except Empty:
+                continue
+            if future.status == "finished":
+                try:
+                    result = future.result(timeout=ALIVE)
+                except (CancelledError, OSError, self._distributed.KilledWorker):
+                    # Its worker died while it handed over the result, or the scheduler did.
+                    future.add_done_callback(done.put)
+                    asked = -ASK
+                    continue
+                i, _ = under_way.pop(future.key)
+                yield i, result
+                continue
+            i, _ = under_way.pop(future.key)
+            if future.status != "error":
+                raise self._gone("it dropped the work")
+            error = future.exception(timeout=ALIVE)
+            if not isinstance(error, self._distributed.KilledWorker):
+                why = (
+                    error if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
+                )
+                raise WorkerError(f"the cluster at {self._address} cannot do the work: {why}")
+            suspects.append(i)
+        return suspects
+
+    def _threads(self) -> int:
+        """How many tasks the workers take at a time; WorkerError where the scheduler is gone."""
+        if self._client.status != "running":
+            raise self._gone("the connection is lost")
+        try:
+            there = self._client.sync(self._client.scheduler.ncores, callback_timeout=ALIVE)
+        except (OSError, RuntimeError) as error:
+            raise self._gone(f"{type(error).__name__}: {error}") from error
+        now = monotonic()
+        if there:
+            self._workers_seen = now
+        elif now - self._workers_seen > WORKERS:
+            raise WorkerError(
+                f"the scheduler at {self._address} has had no worker for {WORKERS:g} s"
+            )
+        elif not self._told:
+            self._told = True
+            tell(
+                f"the scheduler at {self._address} has no worker: waiting up to {WORKERS:g} s; "
+                f"start some with `dask worker {self._address} --nworkers auto --nthreads 1`"
+            )
+        return sum(there.values())
+
+    def _gone(self, why: str) -> WorkerError:
+        return WorkerError(f"the scheduler at {self._address} is gone ({why})")
+
+
+_ALONE = threading.Lock()  # a worker of several threads still does one thing at a time
+
+
+def _do(payload: bytes, expected: str, i: int) -> Any:
+    """One task, on a worker."""
+    with _ALONE:
+        return _load(payload, expected)(i)
+
+
+@lru_cache(maxsize=1)
+def _load(payload: bytes, expected: str) -> Callable[[int], Any]:
+    """The work, once it is sure that it is the same here as where it was sent from."""
+    there = json.loads(expected)
+    here = Fingerprint(None).parts
+    _require_same(there, here, ("hqp_grasp", "versions"))
+    work = importlib.import_module("cloudpickle").loads(payload)
+    here = json.loads(json.dumps(Fingerprint(work).parts))
+    # What was made in a script travels with the work, and has no file here.
+    files = there["source"].keys() & here["source"].keys()
+    for parts in (there, here):
+        parts["source"] = {name: parts["source"][name] for name in files}
+    _require_same(there, here, tuple(there))
+    return work
+
+
+def _require_same(there: dict[str, Any], here: dict[str, Any], names: Sequence[str]) -> None:
+    found = list(differences({n: there[n] for n in names}, {n: here[n] for n in names}))
+    if found:
+        more = f", and {len(found) - 3} more" if len(found) > 3 else ""
+        raise WorkerError(
+            f"worker {os.uname().nodename}:{os.getpid()} differs from the client: "
+            f"{'; '.join(found[:3])}{more} (there: the client, here: the worker); "
+            "give both the same hqp_grasp, Python and libraries"
+        )
+
+
+def need(package: str) -> Any:
+    """A package of the extra `cluster`, or MissingExtraError with the line that installs it."""
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        raise MissingExtraError(
+            f"a cluster needs {package}: pip install 'hqp_grasp[cluster]'"
+        ) from error
+
+
+def tell(message: str) -> None:
+    """Say something beside the progress bar."""
+    tqdm.write(message, file=sys.stderr)
