@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib
 import json
+import logging
 import os
 import re
 import sys
@@ -11,9 +13,9 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, wait
+from concurrent.futures import CancelledError, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -161,6 +163,18 @@ def _on_cluster(work: Callable[[int], T], numbers: Sequence[int], address: str) 
                 yield number, None
 
 
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Without the log of what is going to be raised anyway."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
 class _Cluster:
     """A connection to a scheduler, over which one kind of work is done."""
 
@@ -172,30 +186,43 @@ class _Cluster:
         self._payload = importlib.import_module("cloudpickle").dumps(work)
 
     def __enter__(self) -> _Cluster:
-        # Dask's own would wait 30 s each.
-        self._patience = self._dask.config.set(
-            {
-                "distributed.comm.timeouts.connect": f"{ANSWER}s",
-                "distributed.comm.timeouts.tcp": f"{SILENT}s",
-            }
-        )
-        try:
+        with ExitStack() as stack:
+            # Dask's own are 30 s each.
+            patience = {"connect": f"{ANSWER}s", "tcp": f"{SILENT}s"}
+            stack.enter_context(self._dask.config.set({"distributed.comm.timeouts": patience}))
+            stack.enter_context(_quiet("distributed.client"))
+            self._knock()
             self._client = self._distributed.Client(
                 self._address, timeout=ANSWER, set_as_default=False, name="hqp_grasp"
             )
-        except (OSError, ValueError, ImportError) as error:
-            self._patience.__exit__(None, None, None)
-            raise WorkerError(
-                f"no Dask scheduler answers at {self._address} within {ANSWER:g} s ({error}); "
-                "start one with `dask scheduler`, and workers with `dask worker`"
-            ) from error
+            stack.callback(self._client.close, timeout=2.0)
+            self._open = stack.pop_all()
         self._workers_seen = monotonic()
-        self._told = False
+        self._told: set[str] = set()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._client.close(timeout=2.0)
-        self._patience.__exit__(None, None, None)
+        self._open.close()
+
+    def _knock(self) -> None:
+        """Raise WorkerError unless a scheduler answers: a Client would wait for ever."""
+
+        async def knock() -> Any:
+            keys = self._distributed.Security().get_connection_args("client")
+            async with self._distributed.rpc(self._address, connection_args=keys) as there:
+                return await there.identity()
+
+        try:
+            with ThreadPoolExecutor(1) as aside:  # this thread may have a loop of its own
+                found = aside.submit(asyncio.run, asyncio.wait_for(knock(), ANSWER)).result()
+            if found["type"] != "Scheduler":
+                raise WorkerError(f"it is a {found['type'].lower()}")
+        except Exception as error:  # what answers may be anything, and so may what comes of it
+            raise WorkerError(
+                f"no Dask scheduler answers at {self._address} within {ANSWER:g} s "
+                f"({str(error) or type(error).__name__}); start one with `dask scheduler`, and "
+                "workers with `dask worker`"
+            ) from error
 
     def run(self, numbers: Sequence[int]) -> Generator[tuple[int, Any], None, list[int]]:
         """Yield each number with its result; return those whose workers died, again and again."""
@@ -217,28 +244,33 @@ class _Cluster:
                 future = done.get(timeout=ASK)
             except Empty:
                 continue
-            if future.status == "finished":
-                try:
-                    result = future.result(timeout=ALIVE)
-                except (CancelledError, OSError, self._distributed.KilledWorker):
-                    # Its worker died while it handed over the result, or the scheduler did.
-                    future.add_done_callback(done.put)
-                    asked = -ASK
-                    continue
-                i, _ = under_way.pop(future.key)
-                yield i, result
+            try:
+                error, result = self._outcome(future)
+            except (CancelledError, OSError, self._distributed.KilledWorker):
+                # The worker died before it handed over the result: done again. Or the scheduler.
+                future.add_done_callback(done.put)
+                asked = -ASK
                 continue
             i, _ = under_way.pop(future.key)
-            if future.status != "error":
-                raise self._gone("it dropped the work")
-            error = future.exception(timeout=ALIVE)
-            if not isinstance(error, self._distributed.KilledWorker):
-                why = (
-                    error if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
-                )
-                raise WorkerError(f"the cluster at {self._address} cannot do the work: {why}")
-            suspects.append(i)
+            if error is None:
+                yield i, result
+            elif isinstance(error, self._distributed.KilledWorker):
+                suspects.append(i)
+            else:
+                name = "" if isinstance(error, WorkerError) else f"{type(error).__name__}: "
+                raise WorkerError(
+                    f"the cluster at {self._address} cannot do the work: {name}{error}"
+                ) from error
         return suspects
+
+    def _outcome(self, future: Any) -> tuple[Exception | None, Any]:
+        """What ended a task, and its result; OSError where both are lost."""
+        if future.status == "cancelled":
+            raise self._gone("the connection is lost")
+        if future.status not in ("finished", "error"):
+            raise TimeoutError
+        error = future.exception(timeout=ALIVE)
+        return error, None if error is not None else future.result(timeout=ALIVE)
 
     def _threads(self) -> int:
         """How many tasks the workers take at a time; WorkerError where the scheduler is gone."""
@@ -255,13 +287,18 @@ class _Cluster:
             raise WorkerError(
                 f"the scheduler at {self._address} has had no worker for {WORKERS:g} s"
             )
-        elif not self._told:
-            self._told = True
-            tell(
-                f"the scheduler at {self._address} has no worker: waiting up to {WORKERS:g} s; "
-                f"start some with `dask worker {self._address} --nworkers auto --nthreads 1`"
-            )
+        start = f"`dask worker {self._address} --nworkers auto --nthreads 1`"
+        if not there:
+            self._tell(f"the scheduler has no worker: waiting up to {WORKERS:g} s; {start}")
+        if max(there.values(), default=1) > 1:
+            self._tell(f"a worker runs one trial at a time, however many threads it has; {start}")
         return sum(there.values())
+
+    def _tell(self, message: str) -> None:
+        """Say it once."""
+        if message not in self._told:
+            self._told.add(message)
+            tell(message)
 
     def _gone(self, why: str) -> WorkerError:
         return WorkerError(f"the scheduler at {self._address} is gone ({why})")

@@ -1,0 +1,164 @@
+"""Work is done wherever it is sent, again where a process dies, and never waited for in vain."""
+
+import json
+import socket
+import sys
+import time
+
+import pytest
+from deadly import Square, raises
+
+from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
+from hqp_grasp.experiments import executor
+from hqp_grasp.experiments.executor import address_of, run_all
+from hqp_grasp.experiments.fingerprint import Fingerprint
+
+NO_DASK = "no distributed: pip install 'hqp_grasp[cluster]'"
+
+
+@pytest.fixture
+def silent():
+    """A port that listens and never says a word, as its address."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+# ---------------------------------------------------------------- processes
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_every_number_is_done_once(jobs):
+    assert sorted(run_all(Square(), range(9), jobs)) == [(i, i * i) for i in range(9)]
+
+
+def test_a_number_whose_process_dies_is_done_again(tmp_path):
+    work = Square(deadly=(2,), times=2, marks=tmp_path)
+    assert sorted(run_all(work, range(6), jobs=2)) == [(i, i * i) for i in range(6)]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_number_that_kills_every_process_is_given_up_and_costs_no_other():
+    done = dict(run_all(Square(deadly=(2,)), range(6), jobs=2))
+    assert done == {i: None if i == 2 else i * i for i in range(6)}
+
+
+def test_where_no_process_does_anything_the_study_ends():
+    with pytest.raises(WorkerError, match=r'every process died .* `if __name__ == "__main__":`'):
+        list(run_all(Square(deadly=tuple(range(50))), range(50), jobs=2))
+
+
+def test_what_the_work_raises_is_raised():
+    with pytest.raises(RuntimeError, match="not here"):
+        list(run_all(raises, range(4), jobs=2))
+
+
+def test_few_numbers_are_under_way_at_a_time(monkeypatch):
+    submitted, submit = [], executor.ProcessPoolExecutor.submit
+
+    def counted(pool, work, i):
+        submitted.append(i)
+        return submit(pool, work, i)
+
+    monkeypatch.setattr(executor.ProcessPoolExecutor, "submit", counted)
+    for done, _ in enumerate(run_all(Square(), range(40), jobs=2)):
+        assert len(submitted) - done <= 2 * executor.IN_FLIGHT
+    assert sorted(submitted) == list(range(40))
+
+
+# ---------------------------------------------------------------- addresses
+
+
+def test_an_address_stands_as_it_is_or_in_the_schedulers_file(tmp_path):
+    assert address_of("tcp://node7:8786") == "tcp://node7:8786"
+    assert address_of("node7:8786") == "node7:8786"
+    (tmp_path / "scheduler.json").write_text(json.dumps({"address": "tcp://10.0.0.1:40001"}))
+    assert address_of(tmp_path / "scheduler.json") == "tcp://10.0.0.1:40001"
+
+
+@pytest.mark.parametrize("cluster", ["scheduler.json", "tcp://node7", "node7:", ""])
+def test_what_is_neither_address_nor_file_is_said(cluster, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="the address of a Dask scheduler, tcp://host:8786, or"):
+        address_of(cluster)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}"])
+def test_a_file_that_no_scheduler_wrote_is_said(text, tmp_path):
+    (tmp_path / "s.json").write_text(text)
+    with pytest.raises(InputError, match=r"s\.json is no scheduler file, as `dask scheduler"):
+        address_of(tmp_path / "s.json")
+
+
+# ---------------------------------------------------------------- no cluster
+
+
+def test_without_dask_the_line_that_installs_it_is_given(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dask", None)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'hqp_grasp\[cluster\]'"):
+        list(run_all(Square(), range(3), cluster="tcp://127.0.0.1:8786"))
+
+
+def took(address):
+    pytest.importorskip("distributed", reason=NO_DASK)
+    begin = time.monotonic()
+    with pytest.raises(WorkerError, match=f"no Dask scheduler answers at {address} within"):
+        list(run_all(Square(), range(3), cluster=address))
+    return time.monotonic() - begin
+
+
+def test_an_address_where_nobody_listens_is_an_error_within_ten_seconds(silent):
+    host, port = silent.rsplit(":", 1)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    assert took(f"{host}:{port}") < 10.0
+
+
+def test_an_address_that_never_speaks_is_an_error_within_ten_seconds(silent):
+    assert took(silent) < 10.0
+
+
+# ---------------------------------------------------------------- the same software
+
+
+@pytest.fixture
+def sent():
+    """What a worker gets, the expectations as a dictionary to be changed."""
+    cloudpickle = pytest.importorskip("cloudpickle", reason=NO_DASK)
+    executor._load.cache_clear()
+    work = Square(deadly=(7,))
+    return cloudpickle.dumps(work), Fingerprint(work).parts
+
+
+def test_a_worker_with_the_same_software_does_the_work(sent):
+    payload, expected = sent
+    assert executor._do(payload, json.dumps(expected), 3) == 9
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "told"),
+    [
+        ("hqp_grasp", "sha256:other", "hqp_grasp differs"),
+        ("versions", {"mujoco": "1.0"}, r"versions\.mujoco is '1\.0' there"),
+        ("trial", {"deadly": [8]}, r"trial\.deadly\[0\] is 8 there, 7 here"),
+        ("source", {"deadly": "sha256:other"}, r"source\.deadly differs"),
+    ],
+)
+def test_a_worker_with_other_software_refuses_and_names_it(sent, part, value, told):
+    payload, expected = sent
+    spoilt = {**expected[part], **value} if isinstance(value, dict) else value
+    with pytest.raises(WorkerError, match=rf"worker .* differs from the client: .*{told}"):
+        executor._do(payload, json.dumps(expected | {part: spoilt}), 3)
+
+
+def test_software_is_compared_before_the_work_is_unpacked(sent):
+    _, expected = sent
+    other = expected | {"hqp_grasp": "sha256:other"}
+    with pytest.raises(WorkerError, match="hqp_grasp differs"):
+        executor._do(b"of another version", json.dumps(other), 3)
+
+
+def test_what_was_made_in_a_script_travels_with_the_work(sent):
+    payload, expected = sent
+    there = expected | {"source": expected["source"] | {"__main__": "sha256:mine"}}
+    assert executor._do(payload, json.dumps(there), 3) == 9
