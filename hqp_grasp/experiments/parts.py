@@ -43,17 +43,18 @@ class Parts:
             self._compact()
 
     def _find(self, path: Path) -> None:
-        """Take down which trials are in a file."""
+        """Take down which trials are in a file, or set it aside."""
         try:
-            table = _read(path)
-            trials = table["trial"].unique().to_pylist()
-            failed = table.filter(pc.is_valid(table["error"]))["trial"].unique().to_pylist()
+            self._note(path, _read(path))
         except (pa.ArrowException, OSError, KeyError) as error:
             if isinstance(error, PermissionError):
                 raise
             path.replace(path.with_suffix(".broken"))
             self.broken.append(f"{path.name} ({' '.join(str(error).split())[:80]})")
-            return
+
+    def _note(self, path: Path, table: pa.Table) -> None:
+        trials = table["trial"].unique().to_pylist()
+        failed = table.filter(pc.is_valid(table["error"]))["trial"].unique().to_pylist()
         self._where.update(dict.fromkeys(trials, path))
         self._failed.difference_update(trials)
         self._failed.update(failed)
@@ -71,7 +72,7 @@ class Parts:
         """Write one trial."""
         path = self._folder / f"trial_{trial:06d}.parquet"
         write([table], path)
-        self._where[trial], self._single[trial] = path, table
+        self._note(path, table)
         if len(self._single) >= BATCH:
             self._compact()
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp
@@ -116,9 +117,13 @@ class Record:
     @property
     def verdict(self) -> str:
         """What became of the trial, one of VERDICTS; see `verdicts`."""
-        rows = [row | {"probe": i, "error": self.error} for i, row in enumerate(self.rows)]
-        eps = (f"{e}_true" if f"{e}_true" in self.rows[0] else e for e in ("eps_f", "eps_m"))
-        return _verdict(rows, *eps)
+        names = ("in_contact", "other_links", "limit_violation", "eps_f", "eps_m")
+        there = [n for n in (*names, "eps_f_true", "eps_m_true") if n in self.rows[0]]
+        rows = [
+            {"trial": 0, "probe": i, "error": self.error} | {name: row[name] for name in there}
+            for i, row in enumerate(self.rows)
+        ]
+        return verdicts(pa.Table.from_pylist(rows))[0]
 
     def to_table(self) -> pa.Table:
         """One row a probe; unit and meaning of a column stand in its field's metadata."""
@@ -260,25 +265,40 @@ def verdicts(table: pa.Table) -> dict[int, str]:
     what was felt) from some probe to the last, no link but the contact points in the object at any
     probe from 1 on, no violation of a limit, no error.
     """
-    names = ["trial", "probe", "in_contact", "other_links", "limit_violation", "error"]
-    eps = [f"{e}_true" if f"{e}_true" in table.column_names else e for e in ("eps_f", "eps_m")]
-    rows = table.select([*names, *eps]).sort_by([("trial", "ascending"), ("probe", "ascending")])
-    trials: dict[int, list[dict[str, Any]]] = {}
-    for row in rows.to_pylist():
-        trials.setdefault(row["trial"], []).append(row)
-    return {trial: _verdict(rows, *eps) for trial, rows in trials.items()}
+    rows = in_order(table)
+    trial = rows["trial"].to_numpy()
+    begin = np.flatnonzero(np.diff(trial, prepend=np.nan))
+    last = np.append(begin[1:], len(trial)) - 1
+    eps = (f"{e}_true" if f"{e}_true" in rows.column_names else e for e in ("eps_f", "eps_m"))
+    force, moment = (floats(rows, name)[last] for name in eps)
+    faults = (
+        np.logical_or.reduceat(says_something(rows, "error"), begin),
+        ~rows["in_contact"].to_numpy()[last],
+        ~((force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2)),
+        np.logical_or.reduceat(
+            says_something(rows, "other_links") & (rows["probe"].to_numpy() > 0), begin
+        ),
+        np.logical_or.reduceat(floats(rows, "limit_violation") > 0.0, begin),
+    )
+    gravest = np.select(faults, range(1, len(VERDICTS)), 0)
+    return {int(i): VERDICTS[kind] for i, kind in zip(trial[begin], gravest, strict=True)}
 
 
-def _verdict(rows: list[dict[str, Any]], force: str, moment: str) -> str:
-    last = rows[-1]
-    if any(row["error"] for row in rows):
-        return "error"
-    if not last["in_contact"]:
-        return "lost"
-    if last[force] is None:  # a tip does not touch the object, whatever was felt
-        return "not balanced"
-    if not (last[force] <= CONVERGED_FORCE and last[moment] <= CONVERGED_MOMENT**2):
-        return "not balanced"
-    if any(row["other_links"] for row in rows if row["probe"] > 0):
-        return "link inside"
-    return "violation" if any(row["limit_violation"] > 0.0 for row in rows) else "good"
+def in_order(table: pa.Table) -> pa.Table:
+    """The table by trial and probe, as a study writes it."""
+    trial, probe = (table[name].to_numpy() for name in ("trial", "probe"))
+    step = np.diff(trial)
+    if ((step > 0) | ((step == 0) & (np.diff(probe) > 0))).all():
+        return table
+    return table.take(np.lexsort((probe, trial)))
+
+
+def floats(table: pa.Table, name: str) -> np.ndarray:
+    """A column of numbers, NaN where one is missing."""
+    return table[name].to_numpy().astype(float)
+
+
+def says_something(table: pa.Table, name: str) -> np.ndarray:
+    """Where a column of texts has one that is not empty."""
+    texts = pc.fill_null(table[name].cast(pa.string()), "")
+    return pc.not_equal(texts, "").to_numpy()

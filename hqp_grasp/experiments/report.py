@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,8 @@ from hqp_grasp.experiments.record import (
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
     VERDICTS,
+    floats,
+    in_order,
     verdicts,
 )
 
@@ -49,38 +51,34 @@ def outcomes(folder: str | Path) -> list[Outcome]:
         table = pq.read_table(path, columns=wanted)
     except FileNotFoundError as error:
         raise ResultsError(f"{folder} has no probes.parquet: it is no results folder") from error
-    except pa.ArrowInvalid as error:
+    except (pa.ArrowException, OSError) as error:
         raise ResultsError(f"{path} is broken ({error}); run its scenario again") from error
-    table = table.sort_by([("trial", "ascending"), ("probe", "ascending")])
+    table = in_order(table)
     verdict = verdicts(table)
     true = "_true" if "eps_f_true" in have else ""
-    column = {
-        name: table.column(name).to_numpy(zero_copy_only=False)
-        for name in ("trial", "seed", "in_contact", "adduction_deg")
-    }
-    force, moment = (
-        table.column(f"{name}{true}").to_numpy(zero_copy_only=False).astype(float)
-        for name in ("eps_f", "eps_m")
+    trial, seed = (table[name].to_numpy() for name in ("trial", "seed"))
+    force, moment, adduction = (
+        floats(table, name) for name in (f"eps_f{true}", f"eps_m{true}", "adduction_deg")
     )
     balanced = (force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2)  # NaN: not
-    bounds = np.flatnonzero(np.diff(column["trial"], prepend=-1, append=-1))
-    found = []
-    for begin, end in pairwise(bounds):
-        bad = np.flatnonzero(~balanced[begin:end])
-        first = int(bad[-1]) + 1 if len(bad) else 0
-        touched = begin + np.flatnonzero(column["in_contact"][begin:end])
-        angle = column["adduction_deg"][touched[-1]] if len(touched) else None
-        number = int(column["trial"][begin])
-        found.append(
-            Outcome(
-                int(column["seed"][begin]),
-                number,
-                verdict[number],
-                first if first < end - begin else None,
-                math.nan if angle is None else float(angle),
-            )
+    begin = np.flatnonzero(np.diff(trial, prepend=-1))
+    end = np.append(begin[1:], len(trial))
+    row = np.arange(len(trial))
+    stays = (
+        np.maximum.reduceat(np.where(balanced, -1, row), begin) + 1
+    )  # the row from which it does
+    stays = np.maximum(stays, begin)
+    touch = np.maximum.reduceat(np.where(table["in_contact"].to_numpy(), row, -1), begin)
+    return [
+        Outcome(
+            int(seed[first]),
+            int(trial[first]),
+            verdict[int(trial[first])],
+            int(since - first) if since < after else None,
+            float(adduction[last]) if last >= 0 else math.nan,
         )
-    return found
+        for first, after, since, last in zip(begin, end, stays, touch, strict=True)
+    ]
 
 
 def interval(count: int, total: int) -> tuple[float, float]:

@@ -12,13 +12,21 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import tyro
 
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import HqpGraspError, InputError, TrialError
 from hqp_grasp.experiments.plots import convergence
-from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT, VERDICTS, verdicts
+from hqp_grasp.experiments.record import (
+    CONVERGED_FORCE,
+    CONVERGED_MOMENT,
+    VERDICTS,
+    says_something,
+    verdicts,
+)
 from hqp_grasp.experiments.replay import frames_of_rows, need_viser, rows_of, write_replay
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
@@ -26,6 +34,12 @@ from hqp_grasp.experiments.view import PORT, serve
 from hqp_grasp.tasks import Stack, stack_of
 from hqp_grasp.world.scene import Scene
 
+# What the table on screen and the figure are made of.
+COLUMNS = (
+    *("trial", "probe", "rejected", "error", "eps_f", "eps_m", "eps_k", "adduction_deg"),
+    *("elevation_deg", "in_contact", "other_links", "step_share", "limit_active"),
+    *("limit_violation", "hqp_projection_gap", "method"),
+)
 # Settings that no trial reads.
 ABOUT_THE_RUN = {"trials", "seed", "jobs", "cluster", "out", "strict", "replay", "view", "port"}
 
@@ -155,14 +169,12 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
     about = f"{name}: {Stack.of(trial.stack).name}, {settings.trials} trials"
     print(f"{about} of {settings.probes} probes")
     try:
-        table = study.run(out)
-        errors = {
-            row["trial"]: row["error"] for row in table.select(["trial", "error"]).to_pylist()
-        }
-        failed = [i for i, error in errors.items() if error is not None]
-        if len(failed) == len(errors):
+        table = study.run(out, COLUMNS)
+        ended = table.filter(pc.is_valid(table["error"]))
+        failed = ended["trial"].unique().to_pylist()
+        if len(failed) == settings.trials:
             raise TrialError(
-                f"every trial ended in an error, trial {failed[0]} by {errors[failed[0]]}",
+                f"every trial ended in an error, trial {failed[0]} by {ended['error'][0]}",
                 failed[0],
             )
     except TrialError as error:
@@ -175,7 +187,7 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
         command = replay_command(scene, settings, failed[0])
         print(f"\nreplay trial {failed[0]}, the first that ended in an error:\n{command}")
     print(f"\nresults  {out / 'probes.parquet'}\nfigure   {figure}")
-    _replay(scene, table, settings.replay, out / "replay.html", name)
+    _replay(scene, settings.replay, out, name)
     return table
 
 
@@ -183,9 +195,11 @@ def _out(name: str, settings: Settings) -> Path:
     return settings.out or Path("out") / f"{name}-{settings.stack}-{settings.form}"
 
 
-def _replay(scene: Scene, table: pa.Table, trial: int, path: Path, name: str) -> None:
+def _replay(scene: Scene, trial: int, out: Path, name: str) -> None:
     """Write the replay, or say why there is none: the results stand without it."""
+    path = out / "replay.html"
     try:
+        table = pq.read_table(out / "probes.parquet", filters=[("trial", "=", trial)])
         frames = frames_of_rows(rows_of(table, trial), scene.articulated.joints)
         write_replay(scene, frames, path, f"{name}, trial {trial}")
         print(f"replay   {path}")
@@ -211,7 +225,8 @@ def replay_command(scene: Scene, settings: Settings, trial: int) -> str:
 
 def summary(table: pa.Table) -> str:
     """What came of the trials, for people."""
-    columns = {n: table.column(n).to_numpy(zero_copy_only=False) for n in table.column_names}
+    texts = ("other_links", "method", "error")
+    columns = {n: table[n].to_numpy() for n in COLUMNS if n not in texts}
     trials = len(np.unique(columns["trial"]))
     shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
     touched = shaped["in_contact"].astype(bool)
@@ -248,7 +263,8 @@ def summary(table: pa.Table) -> str:
     others = " · ".join(f"{kind} {verdict[kind]}" for kind in VERDICTS if kind != "good")
     lines.append(f"good{verdict['good']:11} of {trials} in every respect")
     lines.append(f"         {others}")
-    errors = [error for error in shaped["error"][:, 0] if error is not None]
+    ended = table.filter(pc.and_(pc.is_valid(table["error"]), pc.equal(table["probe"], 0)))
+    errors = ended["error"].to_pylist()
     if errors:
         kinds = Counter(error.partition(":")[0] for error in errors).most_common()
         lines.append(f"errors   {', '.join(f'{kind} {count}' for kind, count in kinds)}")
@@ -263,10 +279,11 @@ def summary(table: pa.Table) -> str:
         lines.append(
             f"gap      QP − projection ≤ {np.nanmax(gap):.1e} rad, over {share:.0%} of steps"
         )
-    methods = Counter(method for method in columns["method"] if method is not None)
+    counts = table["method"].drop_null().value_counts().to_pylist()
+    methods = Counter({count["values"]: count["counts"] for count in counts})
     shares = (f"{method} {n / methods.total():.1%}" for method, n in methods.most_common())
     lines.append(f"methods  {', '.join(shares) or '–'} of the steps")
-    other = (shaped["other_links"] != "") & touched
+    other = says_something(table, "other_links").reshape(trials, -1) & touched
     lines.append(
         f"links    another link is in the object in {other.mean():.1%} of the probes, "
         f"at the end of {other[:, -1].sum()} trials"

@@ -82,7 +82,8 @@ class Study:
             parts.merge(whole)
         if failed is not None:
             raise failed
-        return pq.read_table(whole, columns=columns, filters=[("trial", "<", self.trials)])
+        chosen = None if columns is None else list(columns)
+        return pq.read_table(whole, columns=chosen, filters=[("trial", "<", self.trials)])
 
     def _run_missing(self, parts: Parts, out: Path) -> TrialError | None:
         """Run what is not done; return what ended a strict study, if anything did."""

@@ -11,8 +11,8 @@ import pytest
 from own_law import ManyThreadsTask, OneThreadTask
 
 from hqp_grasp.control.controller import Controller
-from hqp_grasp.errors import InputError, ResultsError, SolverError, TrialError
-from hqp_grasp.experiments import executor, fingerprint
+from hqp_grasp.errors import InputError, ResultsError, SolverError, TrialError, WorkerError
+from hqp_grasp.experiments import executor, fingerprint, parts
 from hqp_grasp.experiments import study as module
 from hqp_grasp.experiments.record import COLUMNS, empty_row
 from hqp_grasp.experiments.study import Study
@@ -324,7 +324,91 @@ def test_every_worker_has_one_blas_thread(trial, tmp_path, monkeypatch):
     assert not any(name in os.environ for name in executor.THREADS)
 
 
+def test_a_trial_whose_process_always_dies_is_a_failing_trial(done, study, tmp_path, monkeypatch):
+    def deadly(work, numbers, jobs, cluster):
+        return ((i, None if i == 1 else work(i)) for i in numbers)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "run_all", deadly)
+        table = study.run(tmp_path / "results")
+    assert table.schema.equals(done[1].schema, check_metadata=True)
+    errors = dict(zip(table["trial"].to_pylist(), table["error"].to_pylist(), strict=True))
+    assert errors == {0: None, 1: errors[1], 2: None}
+    assert errors[1].startswith("WorkerError: its process died each time")
+    assert table.num_rows == TRIALS * (PROBES + 1)
+    assert same(study.run(tmp_path / "results"), done[1])
+
+
+def test_where_the_workers_are_gone_it_is_said_how_to_continue(done, study, tmp_path, monkeypatch):
+    def vanishing(work, numbers, jobs, cluster):
+        yield 0, work(0)
+        raise WorkerError("the scheduler is gone")
+
+    out = tmp_path / "results"
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "run_all", vanishing)
+        with pytest.raises(WorkerError) as caught:
+            study.run(out)
+    told = f"the scheduler is gone; 1 trials are in {out}, and the same command continues"
+    assert str(caught.value) == told
+    assert same(study.run(out), done[1])
+
+
+# ---------------------------------------------------------------- parts
+
+
+def test_a_broken_part_is_told_and_its_trial_runs_again(done, study, folder, ran, capsys):
+    part = folder / "parts" / "trial_000001.parquet"
+    part.write_bytes(part.read_bytes()[:-9])
+    assert same(study.run(folder), done[1])
+    assert ran == [1]
+    told = f"{part} (Parquet magic bytes not found"
+    assert told in capsys.readouterr().err
+
+
+def test_a_folder_of_batches_is_continued_and_merged_in_order(
+    done, study, folder, ran, monkeypatch
+):
+    monkeypatch.setattr(parts, "BATCH", 2)
+    table = dataclasses.replace(study, trials=TRIALS + 2).run(folder)
+    assert ran == [TRIALS, TRIALS + 1]
+    assert names(folder / "parts") == ["batch_000000.parquet", "batch_000001.parquet"]
+    assert same(table.slice(0, done[1].num_rows), done[1])
+    assert table["trial"].to_pylist() == sorted(table["trial"].to_pylist())
+    ran.clear()
+    assert study.run(folder).equals(done[1])
+    assert ran == []
+
+
+def test_only_the_columns_asked_for_are_returned(done, study, folder):
+    few = ("probe", "eps_f")
+    assert study.run(folder, columns=few).equals(done[1].select(few))
+
+
 # ---------------------------------------------------------------- refusals
+
+
+def test_a_folder_that_another_run_writes_is_refused(study, folder, ran):
+    with (
+        module._claimed(folder, study.configuration()),
+        pytest.raises(ResultsError, match="is being written by another run; wait until"),
+    ):
+        study.run(folder)
+    assert ran == []
+    study.run(folder)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"seed": 7'])
+def test_a_config_cut_short_is_refused(study, folder, ran, text):
+    (folder / "config.json").write_text(text)
+    with pytest.raises(ResultsError, match=r"config\.json cannot be read, .*another --out"):
+        study.run(folder)
+    assert ran == []
+
+
+def test_what_is_no_address_of_a_cluster_is_said_before_any_work(trial):
+    with pytest.raises(InputError, match="the address of a Dask scheduler"):
+        Study(trial, cluster="node7")
 
 
 @pytest.mark.parametrize("other", ["seed", "probes", "stack", "object", "form"])
