@@ -460,7 +460,7 @@ def test_where_every_trial_fails_that_is_said_and_the_status_is_not_zero(monkeyp
 
 
 def test_an_interrupt_says_that_the_same_command_continues(monkeypatch, tmp_path):
-    def interrupted(self, out):
+    def interrupted(self, out, columns):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Study, "run", interrupted)
