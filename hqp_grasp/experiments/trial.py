@@ -97,8 +97,9 @@ class Trial:
 
     def nothing(self, seed: int | Sequence[int], error: str) -> Record:
         """The record of a trial of which nothing is known but what ended it."""
-        rows = (empty_row(self.scene.articulated, Stack.of(self.stack)),) * (self.probes + 1)
-        return Record(_entropy(seed), rows, (), 0, self.scene.articulated.joints, error)
+        robot = self.scene.articulated
+        rows = (self._empty(robot, Stack.of(self.stack)),) * (self.probes + 1)
+        return Record(_entropy(seed), rows, (), 0, robot.joints, error)
 
     def _run(
         self, seed: int | Sequence[int], probe: Probe | None
