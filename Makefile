@@ -115,6 +115,8 @@ results: $(READY_BENCH) pictures
 	$(call keep,strictness,benchmarks/strictness.py --seed 0)
 	$(call keep,starts,benchmarks/starts.py --draws 200 --seed 0)
 	$(call keep,edges,benchmarks/edges.py)
+	$(call keep,cluster,benchmarks/cluster.py)
+	$(call keep,cluster-large,benchmarks/cluster.py --kills 0 --rounds 0 --large 10000)
 	$(call keep,where-time-goes,benchmarks/where_time_goes.py --problems 1000)
 	$(call keep,solvers,benchmarks/solvers.py)
 	$(call keep,solvers-sizes,benchmarks/solvers.py --sizes --problems 150 --checked 2 --plot docs/images/solvers.png)
@@ -157,7 +159,7 @@ $(READY_OLDEST): pyproject.toml $(MADE)
 
 $(READY_BENCH): pyproject.toml $(MADE)
 	@echo 'Installing hqp_grasp and its peers into $(VENV) (once)'
-	@$(PIP) --editable '.[bench]'
+	@$(PIP) --editable '.[bench,cluster]'
 	@$(COMPILE)
 	@touch $(READY) $@
 

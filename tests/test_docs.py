@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from hqp_grasp.experiments.record import COLUMNS, CONTACT_COLUMNS, LAW_COLUMNS, TRIAL_COLUMNS
-from hqp_grasp.experiments.study import STUDY_COLUMNS
+import hqp_grasp as hg
+from hqp_grasp.experiments.study import _run_one
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -27,6 +27,7 @@ PYTHON_ON = [
     "README.md",
     "index.md",
     "looking.md",
+    "many-trials.md",
     "mink.md",
     "objects.md",
     "only-solver.md",
@@ -36,7 +37,7 @@ PYTHON_ON = [
     "real-hand.md",
     "solver.md",
 ]
-COMMANDS_ON = ["looking.md", "objects.md", "quickstart.md", "real-hand.md", "results.md"]
+COMMANDS_ON = ["looking.md", "many-trials.md", "objects.md", "quickstart.md", "real-hand.md", "results.md"]
 SMALL = ["--probes", "2", "--jobs", "1"]  # in the place of what the page says, and so few trials
 ELSEWHERE = ("benchmarks/", "pytest", "ruff")  # what `make results`, `make test` run
 
@@ -51,6 +52,7 @@ def calls(page):
     """The page's calls of hqp_grasp and of scenarios, each by its arguments after `python`."""
     found = [w for kind, _, code, _ in BLOCKS[page] if kind == "sh" for w in commands(code)]
     python = [w[1:] for w in found if w[0] in ("python", ".venv/bin/python")]
+    python = [w for w in python if "--cluster" not in w]  # `make test-all` starts clusters
     return [w for w in python if not any(part in " ".join(w[:2]) for part in ELSEWHERE)]
 
 
@@ -75,6 +77,11 @@ def call(arguments, monkeypatch):
 def interrupted(viewer):
     raise KeyboardInterrupt
 
+NEEDS = {  # what a page shows beyond what hqp_grasp needs, and the extra that installs it
+    "looking.md": {"viser": "view"},
+    "many-trials.md": {"pandas": "read", "duckdb": "read"},
+}
+
 
 def test_the_pages_that_show_code_are_all_found():
     with_python = [page for page in BLOCKS if any(b[0] == "python" for b in BLOCKS[page])]
@@ -85,8 +92,9 @@ def test_the_pages_that_show_code_are_all_found():
 @pytest.mark.parametrize("page", sorted({*PYTHON_ON, *COMMANDS_ON}))
 def test_what_a_page_shows_runs_and_prints_what_the_page_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    for package, extra in NEEDS.get(page, {}).items():
+        pytest.importorskip(package, reason=f"the page is about the extra hqp_grasp[{extra}]")
     if page == "looking.md":
-        pytest.importorskip("viser", reason="the page is about the extra hqp_grasp[view]")
         monkeypatch.setattr("hqp_grasp.experiments.view.Viewer.play", interrupted)
     names = {"__name__": "__main__"}  # a page's later blocks go on from its earlier ones
     for kind, file, code, shown in BLOCKS[page]:
@@ -110,23 +118,48 @@ def test_make_knows_what_a_page_has_it_make(page):
             subprocess.run([*words, "--dry-run"], cwd=ROOT, check=True, capture_output=True)
 
 
-def test_nothing_else_than_python_and_make_is_shown_as_a_command():
+def test_nothing_but_python_make_pip_and_dask_is_shown_as_a_command():
     found = [w for p in BLOCKS for k, _, code, _ in BLOCKS[p] if k == "sh" for w in commands(code)]
-    assert {words[0] for words in found} <= {"make", "python", ".venv/bin/python"}
+    assert {words[0] for words in found} <= {"make", "python", ".venv/bin/python", "pip", "dask"}
 
 
-def test_the_quickstart_lists_every_column_of_the_results_in_their_order():
-    page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
-    (table,) = re.findall(r"^\| column \|.*?(?=\n\n)", page, re.DOTALL | re.MULTILINE)
-    listed = [
-        name for row in table.splitlines() for name in re.findall(r"`(\S+)`", row.split("|")[1])
-    ]
-    assert listed == [
-        *STUDY_COLUMNS,
-        "probe",
-        *TRIAL_COLUMNS,
-        *COLUMNS,
-        *(f"{name}_{{law}}" for name in LAW_COLUMNS),
-        *(f"contact_{{i}}_{name}" for name in CONTACT_COLUMNS),
-        "q_{joint}",
-    ]
+# A unit on the page, and how the metadata of a column begins.
+UNITS = {"N²": "N^2", "(N·m)²": "(N m)^2", "°": "deg", "µs": "us", "the law's": "unit of the law"}
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """The fields of a trial's rows: {column: meaning}, of a geometric and of a physical probe."""
+    fields = {}
+    for probe in ("geometric", "physical"):
+        scene = hg.Scene(object=hg.Cylinder(0.05))
+        trial = hg.Trial(scene, hg.ForceTask() >> hg.MomentTask(), probes=1, probe=probe)
+        for field in _run_one(trial, 0, 0).schema:
+            fields[field.name] = field.metadata[b"meaning"].decode()
+    return fields
+
+
+def general(column):
+    """The name that a page gives to a column: law, contact point and joint as placeholders."""
+    column = re.sub(r"^(error|status|rank)_.*", r"\1_{law}", column)
+    column = re.sub(r"^contact_\d+_", "contact_{i}_", column)
+    return re.sub(r"^q_.*", "q_{joint}", column)
+
+
+def test_a_page_lists_every_column_of_the_results_with_its_unit_in_their_order(recorded):
+    page = (ROOT / "docs" / "many-trials.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"^\| column \|.*?\n\n|^\| column \|.*\Z", page, re.DOTALL | re.MULTILINE)
+    listed = {}
+    for row in table.strip().splitlines()[2:]:
+        _, names, unit, _, _ = re.split(r"\s*\|\s*", row)
+        listed |= dict.fromkeys(re.findall(r"`(\S+)`", names), unit)
+    meanings = {general(column): meaning for column, meaning in recorded.items()}
+    # Columns of one law, of one contact point and of one joint stand together in the file.
+    assert list(listed) == sorted(meanings, key=list(listed).index)
+    plain = [name for name in recorded if name in listed]
+    assert plain == [name for name in listed if name in recorded]
+    for name, unit in listed.items():
+        if unit == "–":
+            assert not re.match(r"(\S+|\(N m\)\^2): ", meanings[name])
+        else:
+            assert meanings[name].startswith(f"{UNITS.get(unit, unit)}: ")
