@@ -133,7 +133,9 @@ def faster(folder: Path, rounds: int, trials: int, probes: int) -> None:
                 with finishing() as times:
                     study_of(trials, probes, **settings).run(out)
                 shutil.rmtree(out)
-                rates.setdefault(kind, []).append((len(times) - 1) / (times[-1] - times[0]))
+                rate = (len(times) - 1) / (times[-1] - times[0])
+                rates.setdefault(kind, []).append(rate)
+                print(f"{kind}: {rate:.2f} trials/s", file=sys.stderr)
     print(f"\n{trials} trials of {probes} probes, median of {rounds} interleaved runs")
     slowest = np.median(rates["one worker"])
     for kind, found in rates.items():

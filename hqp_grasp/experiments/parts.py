@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
@@ -71,20 +71,20 @@ class Parts:
     def add(self, trial: int, table: pa.Table) -> None:
         """Write one trial."""
         path = self._folder / f"trial_{trial:06d}.parquet"
-        write([table], path)
+        _write([table], path)
         self._note(path, table)
         if len(self._single) >= BATCH:
             self._compact()
 
     def merge(self, whole: Path) -> None:
         """Write all trials, in order, into one file."""
-        write(self._in_order(), whole)
+        _write(self._in_order(), whole, keep=True)
 
     def _compact(self) -> None:
         """Make one file of the single ones."""
         batch = self._folder / f"batch_{self._batches:06d}.parquet"
         trials = sorted(self._single)
-        write([pa.concat_tables([self._single[i] for i in trials])], batch, sync=True)
+        _write([pa.concat_tables([self._single[i] for i in trials])], batch, keep=True)
         self._batches += 1
         for i in trials:
             self._where[i].unlink()
@@ -118,16 +118,19 @@ def _read(path: Path) -> pa.Table:
     return pq.ParquetFile(path, page_checksum_verification=True).read()
 
 
-def write(tables: Sequence[pa.Table] | Iterator[pa.Table], path: Path, sync: bool = False) -> None:
-    """Write the whole file, a row group a table, or nothing."""
+def _write(tables: Iterable[pa.Table], path: Path, keep: bool = False) -> None:
+    """Write the whole file, a row group a table, or nothing; what is to stay, small and safely."""
     part = path.with_suffix(f".{os.getpid()}.part")
     tables = iter(tables)
     first = next(tables)
-    with pq.ParquetWriter(part, first.schema, compression="zstd", write_page_checksum=True) as file:
+    packing = "zstd" if keep else "snappy"
+    with pq.ParquetWriter(
+        part, first.schema, compression=packing, write_page_checksum=True
+    ) as file:
         file.write_table(first)
         for table in tables:
             file.write_table(table)
-    if sync:
+    if keep:
         with part.open("rb") as written:
             os.fsync(written.fileno())
     part.replace(path)
