@@ -52,6 +52,7 @@ class Mutant:
 
 
 TRIAL, STUDY, SCENE = (f"experiments/test_{name}.py" for name in ("trial", "study", "scenario"))
+PARTS = "experiments/test_parts.py"
 PRINTS = "experiments/test_fingerprint.py"
 
 MUTANTS = (
@@ -81,12 +82,7 @@ MUTANTS = (
     # Links count only deep in the object.
     Mutant("touch/geometric.py:OVERLAP", "1e-7", "1e-3", "touch"),
     # Workers have all the threads that they like.
-    Mutant(
-        "experiments/study.py:Study._run_missing",
-        "_one_blas_thread(),",
-        "closing(tempfile.TemporaryFile()),",
-        STUDY,
-    ),
+    Mutant("experiments/executor.py:_in_processes", "_one_blas_thread()", "ExitStack()", STUDY),
     Mutant("control/forms.py:TOUCH_RANK", "1e-6", "1e-9", "control"),
     Mutant("control/landing.py:LANDING_STEPS", "3", "1", "control"),
     Mutant("control/landing.py:LANDING_DAMPING", "1e-2", "1e-1", "control"),
@@ -127,7 +123,7 @@ MUTANTS = (
     ),
     # A killed run leaves half a file.
     Mutant(
-        "experiments/study.py:_write", 'path.with_suffix(f".{os.getpid()}.part")', "path", STUDY
+        "experiments/parts.py:_write", 'path.with_suffix(f".{os.getpid()}.part")', "path", PARTS
     ),
     # A damped level forgets those above it.
     Mutant("hierarchy/hqp.py:HQP.damped", "[*held, Level(", "[Level(", "hierarchy"),

@@ -1,9 +1,11 @@
-"""Work that some processes do not survive, where worker processes can import it."""
+"""Work that tells on its process or kills it, where worker processes can import it."""
 
 import os
 import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 
 @dataclass(frozen=True)
@@ -32,3 +34,18 @@ def raises(i):
     if i == 1:
         raise RuntimeError("not here")
     return i
+
+
+@dataclass(frozen=True)
+class Slow:
+    """Work that counts how often it is done at once in this process."""
+
+    now: ClassVar[int] = 0
+    most: ClassVar[int] = 0
+
+    def __call__(self, i):
+        Slow.now += 1
+        Slow.most = max(Slow.most, Slow.now)
+        time.sleep(0.01)
+        Slow.now -= 1
+        return i

@@ -4,9 +4,10 @@ import json
 import socket
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from deadly import Square, raises
+from deadly import Slow, Square, raises
 
 from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
 from hqp_grasp.experiments import executor
@@ -133,6 +134,15 @@ def sent():
 def test_a_worker_with_the_same_software_does_the_work(sent):
     payload, expected = sent
     assert executor._do(payload, json.dumps(expected), 3) == 9
+
+
+def test_a_worker_of_several_threads_does_one_thing_at_a_time():
+    cloudpickle = pytest.importorskip("cloudpickle", reason=NO_DASK)
+    payload = cloudpickle.dumps(Slow())
+    expected = json.dumps(Fingerprint(Slow()).parts)
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(lambda i: executor._do(payload, expected, i), range(8)))
+    assert Slow.most == 1
 
 
 @pytest.mark.parametrize(
