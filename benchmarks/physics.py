@@ -13,13 +13,18 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import matplotlib
 import mujoco
 import numpy as np
 import tyro
 
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
 import hqp_grasp as hg
-from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
+from hqp_grasp.experiments.record import BEYOND, CONVERGED_FORCE, CONVERGED_MOMENT
 from hqp_grasp.experiments.start import FirstTouch
 from hqp_grasp.touch.imperfections import FAULTS, Fault
 
@@ -28,8 +33,6 @@ OBJECTS = {
     "cylinder_65": hg.Cylinder(radius=0.065),
     "hexagon": hg.Prism.regular(6, 0.05),
 }
-TIP = 0.008  # [m] radius of a fingertip
-BEYOND = 4.0  # times the floor, from which on a grasp is truly unbalanced
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,18 +95,23 @@ def closing(starts: int = 60, seed: int = 100) -> None:
             hand.place(q)
             hand.worst = dict.fromkeys(hand.worst, 0.0)
             felt = probe.touch(q)
-            peaks.append(hand.worst["force [N]"])
             largest = {name: max(v, hand.worst[name]) for name, v in largest.items()}
             if isinstance(felt, hg.Missed):
                 missed[felt.reason.value] += 1
             else:
+                peaks.append(hand.worst["force [N]"])
                 steady += np.linalg.norm(hand.truth().forces, axis=1).tolist()
         print(f"{contact}: {starts} touches at 1 N, missed: {dict(missed) or 0}")
-        print(f"  peak force   median {np.median(peaks):.2f}, largest {max(peaks):.2f} N")
+        print(
+            f"  peak force   where felt: median {np.median(peaks):.2f}, largest {max(peaks):.2f} N"
+        )
         low, middle, high = np.percentile(steady, [2.5, 50, 97.5])
         within = np.mean(np.abs(np.array(steady) - 1.0) <= 0.1)
         print(f"  steady force {low:.2f} / {middle:.2f} / {high:.2f} N; {within:.1%} within 10 %")
-        print("  largest at any step: " + ", ".join(f"{n} {v:.3g}" for n, v in largest.items()))
+        print(
+            "  largest at any step, misses and ways back included: "
+            + ", ".join(f"{n} {v:.3g}" for n, v in largest.items())
+        )
 
 
 def convergence(
@@ -149,14 +157,15 @@ def interval(values: np.ndarray) -> str:
     return f"{values.mean():6.2f} [{a:.2f}, {b:.2f}] ± {values.std(ddof=1):.2f} [{c:.2f}, {d:.2f}]"
 
 
-def figure5(trials: int = 20, probes: int = 25, seed: int = 102, timestep: float = 0.002) -> None:
+def figure5(
+    trials: int = 20,
+    probes: int = 25,
+    seed: int = 102,
+    timestep: float = 0.002,
+    plot: Path = Path("out/figure5.png"),
+) -> None:
     """The paper's experiment on the physical robot: 20 trials of 25 probes, with noise."""
-    about = hg.Imperfections.preset("loadcell")
-    floor_f, floor_m = about.floor(1.0, TIP, OBJECTS["cylinder_65"].radius)
-    print(
-        f"floor at 1 N: ε_f {floor_f:.1e} N², √ε_m {1e3 * np.sqrt(floor_m):.2f} mm·N "
-        "(sensor noise alone)"
-    )
+    sets: dict[str, list[Outcome]] = {}
     for name, preset in (("noise-free", None), ("loadcell", "loadcell")):
         begin = time.process_time()
         trial = trial_of(
@@ -164,7 +173,7 @@ def figure5(trials: int = 20, probes: int = 25, seed: int = 102, timestep: float
         )
         outcomes = run(trial, trials, seed)
         seconds = time.process_time() - begin
-        ended = [o for o in outcomes if not o.record.lost]
+        ended = sets[name] = [o for o in outcomes if not o.record.lost]
         print(f"{name}: {len(ended)} of {trials} finish; {seconds:.1f} s CPU; {lost(outcomes)}")
         for column in ("adduction_deg", "elevation_deg"):
             last = np.array([o.record.column(column).astype(float)[-1] for o in ended])
@@ -174,52 +183,90 @@ def figure5(trials: int = 20, probes: int = 25, seed: int = 102, timestep: float
         print(f"  felt   ε_f {middle[0]:.1e} N², √ε_m {1e3 * np.sqrt(middle[1]):.2f} mm·N, medians")
         force, moment = np.nanmedian([o.eps[-1] for o in ended], axis=0)
         print(f"  true   ε_f {force:.1e} N², √ε_m {moment:.2f} mm·N, medians")
+        floor = [[o.record.column(f"floor_{a}")[-1] for a in "fm"] for o in ended]
+        force, moment = np.nanmedian(floor, axis=0)
+        print(f"  floor  ε_f {force:.1e} N², √ε_m {1e3 * np.sqrt(moment):.2f} mm·N, by noise alone")
+    draw_figure5(sets, plot)
+
+
+def draw_figure5(sets: dict[str, list[Outcome]], path: Path) -> None:
+    """True errors over the probes, and where the hands began and ended; noisy over noise-free."""
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    for (name, outcomes), colour in zip(sets.items(), ("#0072b2", "#d55e00"), strict=True):
+        eps = np.array([o.eps for o in outcomes])  # (trials, probes, 2)
+        for a, axis in enumerate(axes[:2]):
+            low, middle, high = np.nanpercentile(eps[..., a], [5, 50, 95], axis=0)
+            axis.fill_between(np.arange(len(low)), low, high, color=colour, alpha=0.2)
+            axis.plot(middle, color=colour, label=name)
+        posture = np.array(
+            [
+                [o.record.column(c).astype(float) for c in ("adduction_deg", "elevation_deg")]
+                for o in outcomes
+            ]
+        )
+        if name == "noise-free":
+            axes[2].plot(*posture[:, :, 0].T, "k.", label="start")
+        axes[2].plot(*posture[:, :, -1].T, "o", mfc="none", color=colour, label=f"end, {name}")
+    for axis, label in zip(axes, ("true ε_f [N²]", "true √ε_m [mm·N]"), strict=False):
+        axis.set(yscale="log", xlabel="probe", ylabel=label)
+    axes[2].set(xlabel="adduction [°]", ylabel="elevation [°]")
+    for axis in axes:
+        axis.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
 
 
 def faults(trials: int = 100, probes: int = 12, seed: int = 103) -> None:
     """Each fault at a random moment: what became of the trial, and of the limits."""
     about = hg.Imperfections.preset("loadcell")
-    floor_f, _ = about.floor(1.0, TIP, 0.05)
     trial = trial_of(OBJECTS["cylinder"], hg.Physics(), probes)
-    starts = [_begun(trial, seed, i) for i in range(trials)]
+    print(f"{trials} trials of {probes} probes, seed {seed}, a fault in each but the first line's")
     for kind in (None, *FAULTS):
-        ends, false_claims, errors, worst = Counter(), 0, Counter(), Counter()
-        for i, start in enumerate(starts):
-            rng = np.random.default_rng([seed, i, 7])
-            broken: tuple[Fault, ...] = ()
-            if kind is not None:
-                lasts = 0.002 if kind == "spike" else float(rng.uniform(0.5, 4.0))
-                broken = (Fault(kind, int(rng.integers(3)), float(rng.uniform(0.0, 15.0)), lasts),)
+        ends, false_claims, errors, reactions = Counter(), 0, Counter(), Counter()
+        largest = dict.fromkeys(("peak_force", "peak_speed", "peak_torque", "limit_violation"), 0.0)
+        begin = time.process_time()
+        for i in range(trials):
+            broken = () if kind is None else (random_fault(kind, (seed, i)),)
             physics = hg.Physics(imperfections=replace(about, faults=broken))
-            hand = hg.SimulatedHand(start.scene, physics, "pass", rng)
-            hand.place(start.grasp.q)
-            probe = hg.PhysicalProbe(hand, start.scene.articulated)
-            history, true = [hg.Touch(start.grasp.q, probe.touch(start.grasp.q))], [np.nan]
-            controller = trial.controller(start.scene, i)
-            reason = ""
-            try:
-                while len(history) <= probes and not reason:
-                    step = controller.step(history)
-                    if step.q_target is None:
-                        reason = step.reason.partition(":")[0].partition(",")[0]
-                        break
-                    history.append(hg.Touch(step.q_target, probe.touch(step.q_target)))
-                    grasp = hand.truth().grasp
-                    true.append(np.nan if grasp is None else hg.ForceTask().potential(grasp))
-            except Exception as error:  # counted: the campaign is about these
-                errors[f"{type(error).__name__}: {error}"] += 1
-            felt = history[-1].felt
-            balanced = isinstance(felt, hg.Grasp) and (
-                hg.ForceTask().potential(felt) <= BEYOND * floor_f
-            )
-            false_claims += balanced and not true[-1] <= BEYOND * floor_f
-            ends["balanced" if balanced else ("gave up" if reason else "not balanced")] += 1
-            worst.update({k: max(0.0, v - worst[k]) for k, v in hand.worst.items()})
+            record = replace(trial, probe=physics).attempt((seed, i))
+            last = record.rows[-1]
+            if record.error is not None:
+                errors[record.error] += 1
+            claimed = record.converged_at is not None
+            false_claims += claimed and unbalanced(last)
+            missed = [row["reaction"] for row in record.rows if row["reaction"]]
+            reactions.update(what.partition(" by ")[0] for what in missed)
+            gave_up = "gave up" in missed
+            end = "balanced" if claimed else "gave up" if gave_up else "not balanced"
+            ends[end + (" after a miss" if claimed and missed else "")] += 1
+            for name in largest:
+                seen = record.column(name)
+                largest[name] = max(largest[name], float(np.nanmax(seen, initial=0.0)))
         print(
-            f"{kind or 'none':8} {trials} trials: {dict(ends)}; reported balanced and truly far "
-            f"from it {false_claims}; exceptions {dict(errors) or 0}; largest "
-            + ", ".join(f"{n} {v:.3g}" for n, v in worst.items())
+            f"{kind or 'none':8}{', '.join(f'{n} {what}' for what, n in sorted(ends.items()))}; "
+            f"wrongly felt balanced {false_claims}; exceptions {dict(errors) or 0}; largest "
+            f"{largest['peak_force']:.1f} N, {largest['peak_speed']:.2f} of a speed, "
+            f"{largest['peak_torque']:.2f} of a torque, {largest['limit_violation']:.4f} rad out; "
+            f"{time.process_time() - begin:.0f} s CPU"
         )
+        print(f"{'':8}reactions: {dict(reactions.most_common())}")
+
+
+def random_fault(kind: str, seed: tuple[int, int]) -> Fault:
+    """One that begins in the first 15 s, at one finger, and lasts up to 4 s."""
+    rng = np.random.default_rng([*seed, 7])
+    lasts = 0.002 if kind == "spike" else float(rng.uniform(0.5, 4.0))
+    return Fault(kind, int(rng.integers(3)), float(rng.uniform(0.0, 15.0)), lasts)
+
+
+def unbalanced(row: dict[str, object]) -> bool:
+    """Truly beyond BEYOND times the floor, or not in contact."""
+    for axis in "fm":
+        true, floor = row[f"eps_{axis}_true"], row[f"floor_{axis}"]
+        if true is None or floor is None or not true <= BEYOND * floor:
+            return True
+    return False
 
 
 def _begun(trial: hg.Trial, seed: int, i: int) -> FirstTouch:

@@ -1,6 +1,6 @@
 """How well a fingertip knows where it is touched: `sense` against MuJoCo's own contacts, and noise.
 
-    python benchmarks/sensing.py --starts 60 --seed 0
+    python benchmarks/sensing.py --starts 120 --seed 0
 
 Simulated fingers press a fixed cylinder with 1 to 5 N, at two frictions, on contacts of three
 kinds. What `sense` says of one noise-free sample is compared with the contact's normal n and
@@ -10,8 +10,14 @@ noise, one sample each.
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import matplotlib
 import numpy as np
 import tyro
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 
 import hqp_grasp as hg
 from hqp_grasp.touch.physical import payload, weight
@@ -21,6 +27,7 @@ FRICTIONS = (0.4, 0.8)
 WANTED = (0.02, 0.1)  # [mm], [°] on stiff contacts
 NOISES = ((3e-3, 1.6e-5), (12.5e-3, 6e-5), (20e-3, 2e-4))  # [N], [N·m] of each axis
 FORCES = (0.3, 0.5, 1.0, 2.0, 3.0, 5.0)  # [N]
+PRESSED = 0.9  # [N] at least, to count: below, the finger has slid off
 AIM = 2.0  # [°]
 
 
@@ -47,6 +54,8 @@ def against_mujoco(starts: np.ndarray, scene: hg.Scene, contact: str, seed: int)
                 continue
             frames = truth.R_world_tip
             for i, pushed in enumerate(wrench - weight(load, frames)):
+                if np.linalg.norm(pushed[:3]) < PRESSED:
+                    continue
                 position, normal = hg.sense(pushed, float(robot.tip_radius[i]))
                 true = frames[i].T @ truth.grasp.contacts[i].normal
                 off = 1e3 * float(np.linalg.norm(position + robot.tip_radius[i] * true))
@@ -71,13 +80,16 @@ def with_noise(noise: tuple[float, float], force: float, count: int, seed: int) 
     return np.array(errors)
 
 
-def main(starts: int = 60, seed: int = 0, count: int = 2000) -> None:
-    """Print both tables.
+def main(
+    starts: int = 120, seed: int = 0, count: int = 2000, plot: Path = Path("out/sensing.png")
+) -> None:
+    """Print both tables, and draw the second.
 
     Args:
         starts: postures to press from, at each friction and kind of contact
         seed: trial i draws from SeedSequence([seed, i])
         count: synthetic wrenches for each noise and force
+        plot: where to
     """
     scene = hg.Scene(object=hg.Cylinder(radius=0.05))
     geometric = hg.GeometricProbe(scene, "pass")
@@ -98,14 +110,24 @@ def main(starts: int = 60, seed: int = 0, count: int = 2000) -> None:
             f" torque about the normal up to {found[:, 3].max():.1f} mm·N"
         )
     print(f"\nwith noise, error of the normal, median / 95 %, {count} wrenches each")
-    for noise in NOISES:
-        print(f"{1e3 * noise[0]:g} mN, {1e3 * noise[1]:g} mN·m")
+    figure, axis = plt.subplots(figsize=(6.5, 4.2), layout="constrained")
+    for n, noise in enumerate(NOISES):
+        name = f"{1e3 * noise[0]:g} mN, {1e3 * noise[1]:g} mN·m"
+        seen = [np.percentile(with_noise(noise, f, count, seed), [50, 95]) for f in FORCES]
+        axis.loglog(FORCES, [middle for middle, _ in seen], f"C{n}-", label=f"{name}: median")
+        axis.loglog(FORCES, [most for _, most in seen], f"C{n}--", label="95 %")
+        print(name)
         unit = with_noise(noise, 1.0, count, seed)
-        for force in FORCES:
-            middle, most = np.percentile(with_noise(noise, force, count, seed), [50, 95])
+        for force, (middle, most) in zip(FORCES, seen, strict=True):
             print(f"  {force:4.1f} N   {middle:6.2f}° / {most:6.2f}°")
         middle, most = np.percentile(unit, [50, 95]) / AIM
         print(f"  {AIM:g}° needs {middle:.2f} N in the median, {most:.2f} N for 95 %")
+    axis.axhline(AIM, color="k", ls=":")
+    axis.set(xlabel="force at the tip [N]", ylabel="error of the normal, one sample [°]")
+    axis.legend(fontsize=8)
+    plot.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(plot, dpi=110)
+    plt.close(figure)
 
 
 if __name__ == "__main__":

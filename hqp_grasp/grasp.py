@@ -167,6 +167,7 @@ class Miss(Enum):
     INSIDE = "a fingertip began inside the object"
     OTHER_LINK = "another link touches the object"
     BLOCKED = "the hand stopped itself on the way"
+    STUCK = "the hand does not open"
     OWN_LINK = "a finger closed onto the hand itself"
     TABLE = "a fingertip met what the object stands on"
     LOST = "a contact was lost while the hand held"

@@ -26,7 +26,9 @@ SHARES = (1.0, 0.5, 0.25)  # of a step, tried in turn while it finds nothing to 
 RETREAT = 0.01  # [m] the palm withdraws by, for each time that a link was in the way
 MAX_RETREATS = 6
 IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE)  # what the palm withdraws from
-MAX_SILENT = 4  # touches from one grasp that a sensor may cost
+BROKEN = (Miss.SENSOR, Miss.STUCK)  # no fault of the step, and it may pass
+PASSING = (*BROKEN, Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR)  # what the first touch tries again
+MAX_BROKEN = 4  # touches from one grasp that this may cost
 CLIP_TOLERANCE = 1e-9  # [rad] a solver's rounding may leave a range by; more is a bug
 
 
@@ -63,8 +65,9 @@ class Controller:
 
     After a miss the step is taken again from the last grasp, shorter: SHARES of it in turn. Where
     another link than the fingertips met the object, or a fingertip the table, the palm withdraws on
-    the next step, by RETREAT more at each such miss. Where a sensor was silent the same step is
-    tried again. Then, or once the `budget` of touches is spent, the controller gives up.
+    the next step, by RETREAT more at each such miss. Where a sensor was silent, or the hand did not
+    open, the same step is tried again. Then, or once the `budget` of touches is spent, the
+    controller gives up.
     """
 
     robot: Robot
@@ -102,15 +105,17 @@ class Controller:
         Raises InputError for an empty history, or one that is not of this robot.
         """
         grasp, misses = self._latest(history)
+        if grasp is None and misses[-1].reason in PASSING and len(misses) < MAX_BROKEN:
+            return Step(history[0].q_target, reason="the same again")
         if grasp is None:
             return Step(None, reason="no touch has felt a grasp yet: begin where the hand touches")
         if self.budget is not None and len(history) >= self.budget:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
         blocked = sum(missed.reason in IN_THE_WAY for missed in misses)
-        silent = sum(missed.reason is Miss.SENSOR for missed in misses)
-        short = len(misses) - blocked - silent
+        broken = sum(missed.reason in BROKEN for missed in misses)
+        short = len(misses) - blocked - broken
         shares = getattr(self.form, "shares", SHARES)
-        if short == len(shares) or blocked == MAX_RETREATS or silent == MAX_SILENT:
+        if short == len(shares) or blocked == MAX_RETREATS or broken == MAX_BROKEN:
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
@@ -125,7 +130,7 @@ class Controller:
         reactions = {
             f"palm back by {1e3 * blocked * RETREAT:g} mm": blocked,
             f"{shares[short]:g} of the step": short,
-            "the same again": silent and misses[-1].reason is Miss.SENSOR,
+            "the same again": broken and misses[-1].reason in BROKEN,
         }
         reason = ", ".join(what for what, done in reactions.items() if done)
         return Step(self._clipped(grasp, x), (), plan, shares[short], reason)

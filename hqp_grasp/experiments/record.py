@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +15,12 @@ from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.tasks.stack import Stack
-from hqp_grasp.touch.simulated import Truth
+from hqp_grasp.touch.simulated import SimulatedHand
 from hqp_grasp.world.robot import Robot
 
 CONVERGED_FORCE = 1e-3  # [N²]
 CONVERGED_MOMENT = 2e-3  # √ε_m [N·m]
+BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
 
 # Name, unit and meaning of the columns that every probe fills.
 COLUMNS = {
@@ -44,7 +46,13 @@ TRUE_COLUMNS = {
     "eps_f_true": "N^2: as eps_f, of the contacts as they are; null where a tip is not in contact",
     "eps_m_true": "(N m)^2: as eps_m, of the contacts as they are",
     "object_moved": "m: the object's middle, since the first touch began",
+    "floor_f": "N^2: eps_f that a balanced grasp is felt with, by the sensors' noise, on average",
+    "floor_m": "(N m)^2: eps_m, likewise",
+    "peak_force": "N: the largest at a fingertip so far, as it is",
+    "peak_speed": "share of its limit: the fastest joint so far, as it is",
+    "peak_torque": "share of its limit: the largest of any joint so far, as it is",
 }
+BALANCE_COLUMNS = ("eps_f", "eps_m", "floor_f", "floor_m")
 # The columns that say the same in every row of a trial.
 TRIAL_COLUMNS = {
     "rejected": "starting postures that did not touch",
@@ -108,9 +116,9 @@ class Record:
 
     @property
     def converged_at(self) -> int | None:
-        """First probe from which ε_f ≤ CONVERGED_FORCE and √ε_m ≤ CONVERGED_MOMENT to the end."""
-        force, moment = self.column("eps_f"), np.sqrt(self.column("eps_m"))
-        bad = ~((force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT))
+        """First probe from which the grasp is felt to be balanced, to the end; see `balanced`."""
+        names = [name for name in BALANCE_COLUMNS if name in self.rows[0]]
+        bad = ~balanced({name: self.column(name) for name in names})
         last = int(np.flatnonzero(bad)[-1]) if bad.any() else -1
         return None if last == len(bad) - 1 else last + 1
 
@@ -151,6 +159,21 @@ class Record:
                 "Record.to_table() is the same as an arrow table"
             ) from error
         return self.to_table().to_pandas()
+
+
+def balanced(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Rows (r,) in which the grasp is felt to be balanced, from their BALANCE_COLUMNS.
+
+    ε_f ≤ CONVERGED_FORCE and √ε_m ≤ CONVERGED_MOMENT; where the sensors' noise has a floor, BEYOND
+    times that where it is more: below, nothing can be told from balance.
+    """
+    eps_f, eps_m, *floors = (
+        columns[name].astype(float) for name in BALANCE_COLUMNS if name in columns
+    )
+    limits = [np.full(len(eps_f), CONVERGED_FORCE), np.full(len(eps_m), CONVERGED_MOMENT**2)]
+    for limit, floor in zip(limits, floors, strict=False):  # a geometric probe's has none
+        np.fmax(limit, BEYOND * floor, out=limit)
+    return (eps_f <= limits[0]) & (eps_m <= limits[1])  # NaN: not
 
 
 def meaning(column: str) -> str:
@@ -226,16 +249,25 @@ def felt_row(
     return row | {f"q_{joint}": float(q) for joint, q in zip(robot.joints, grasp.q, strict=True)}
 
 
-def true_columns(truth: Truth | None) -> dict[str, object]:
+def true_columns(
+    hand: SimulatedHand | None = None, floor: tuple[float, float] | None = None
+) -> dict[str, object]:
     """TRUE_COLUMNS, and the links in the object as they are; None where nothing is known."""
-    if truth is None:
-        return dict.fromkeys(TRUE_COLUMNS)
+    row: dict[str, object] = dict.fromkeys(TRUE_COLUMNS)
+    if hand is None:
+        return row
+    truth = hand.truth()
     grasp = truth.grasp
-    return {
+    if floor is not None:
+        row["floor_f"], row["floor_m"] = floor
+    return row | {
         "eps_f_true": None if grasp is None else ForceTask().potential(grasp),
         "eps_m_true": None if grasp is None else MomentTask().potential(grasp),
         "object_moved": truth.moved,
         "other_links": ", ".join(truth.other_links),
+        "peak_force": hand.worst["force [N]"],
+        "peak_speed": hand.worst["speed share"],
+        "peak_torque": hand.worst["torque share"],
     }
 
 

@@ -21,9 +21,12 @@ from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import HqpGraspError, InputError, TrialError
 from hqp_grasp.experiments.plots import convergence
 from hqp_grasp.experiments.record import (
+    BEYOND,
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
+    TRUE_COLUMNS,
     VERDICTS,
+    balanced,
     says_something,
     verdicts,
 )
@@ -231,7 +234,7 @@ def summary(table: pa.Table) -> str:
     shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
     touched = shaped["in_contact"].astype(bool)
     force, moment = shaped["eps_f"].astype(float), 1e3 * np.sqrt(shaped["eps_m"].astype(float))
-    good = (force <= CONVERGED_FORCE) & (moment <= 1e3 * CONVERGED_MOMENT)
+    good = balanced(columns).reshape(trials, -1)
     stays = np.flip(np.logical_and.accumulate(np.flip(good, axis=1), axis=1), axis=1)
     converged = stays.any(axis=1)
     first = stays.argmax(axis=1)[converged]
@@ -258,7 +261,9 @@ def summary(table: pa.Table) -> str:
     lines.append(
         f"\nconverged{converged.sum():6} of {trials}{after}: "
         f"ε_f ≤ {CONVERGED_FORCE:g} N², √ε_m ≤ {1e3 * CONVERGED_MOMENT:g} mm·N, kept to the end"
+        + (f", or {BEYOND:g} × the floor" if "floor_f" in columns else "")
     )
+    lines += _physical(columns, shaped)
     verdict = Counter(verdicts(table).values())
     others = " · ".join(f"{kind} {verdict[kind]}" for kind in VERDICTS if kind != "good")
     lines.append(f"good{verdict['good']:11} of {trials} in every respect")
@@ -290,3 +295,28 @@ def summary(table: pa.Table) -> str:
     )
     lines.append(f"rejected {shaped['rejected'][:, 0].sum()} draws that could not start")
     return "\n".join(lines)
+
+
+def _physical(columns: dict[str, np.ndarray], shaped: dict[str, np.ndarray]) -> list[str]:
+    """What a simulated hand adds: its sensors' floor, what is true, how hard it was used."""
+    if "floor_f" not in columns:
+        return []
+    at_end = {name: shaped[name][:, -1].astype(float) for name in TRUE_COLUMNS}
+    at_end = {name: values[np.isfinite(values)] for name, values in at_end.items()}
+    lines = []
+    for label, force, moment in (
+        ("true     {} at the end, medians", "eps_f_true", "eps_m_true"),
+        ("floor    {}: what noise makes of balance", "floor_f", "floor_m"),
+    ):
+        if len(at_end[force]):
+            f, m = np.median(at_end[force]), 1e3 * np.sqrt(np.median(at_end[moment]))
+            lines.append(label.format(f"ε_f {f:.1e} N², √ε_m {m:.2f} mm·N"))
+    most = {name: np.nanmax(columns[name].astype(float)) for name in TRUE_COLUMNS}
+    lines.append(
+        f"hand     at most {most['peak_force']:.2f} N at a fingertip, {most['peak_speed']:.0%} of "
+        f"a joint's speed limit, {most['peak_torque']:.0%} of its torque limit"
+    )
+    moved = at_end["object_moved"]
+    if moved.any():
+        lines.append(f"         the object moved by {1e3 * np.median(moved):.2f} mm in the median")
+    return lines

@@ -30,6 +30,7 @@ from hqp_grasp.touch.simulated import Physics, SimulatedHand
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
+PRESS = 1.0  # [N] at each fingertip while it feels
 MAX_UNHELD = 20  # postures in a row that touch by geometry and not by force
 IMPERFECTIONS = 1  # their random numbers are a stream of their own: starts are those without
 
@@ -149,6 +150,10 @@ class Trial:
     ) -> FirstTouch:
         """A start found by geometry; where a simulated hand cannot hold it, the next one."""
         rejected, last = 0, ""
+        physics = self.physics
+        if physics is not None and physics.imperfections.faults:  # they come later
+            whole = replace(physics, imperfections=replace(physics.imperfections, faults=()))
+            return replace(self, probe=whole, preset=None)._drawn(start, entropy, rng)
         for _ in range(MAX_UNHELD):
             began = start.draw(self.scene, lambda scene: GeometricProbe(scene, self.links), rng)
             rejected += began.rejected
@@ -197,13 +202,13 @@ class Trial:
         rng = np.random.default_rng(np.random.SeedSequence([*entropy, IMPERFECTIONS]))
         hand = SimulatedHand(began.scene, physics, self.links, rng)
         hand.place(began.grasp.q)
-        return hand, PhysicalProbe(hand, began.scene.articulated, table=hand.table)
+        return hand, PhysicalProbe(hand, began.scene.articulated, PRESS, hand.table)
 
     def _empty(
         self, robot: Robot, stack: Stack, solution: Solution | None = None
     ) -> dict[str, object]:
         row = empty_row(robot, stack, solution)
-        return row if self.physics is None else row | true_columns(None)
+        return row if self.physics is None else row | true_columns()
 
     def _row(
         self,
@@ -216,13 +221,23 @@ class Trial:
         felt, worst = touch.felt, robot.violation(touch.q_target)
         row = self._empty(robot, stack, solution)
         if isinstance(felt, Missed):
-            row |= {"outcome": f"{felt.reason.value} ({felt.where})", "limit_violation": worst}
+            row["outcome"] = f"{felt.reason.value} ({felt.where})"
         else:
             row |= felt_row(robot, stack, felt, solution)
-            row["limit_violation"] = max(worst, robot.violation(felt.q))
+            worst = max(worst, robot.violation(felt.q))
         if hand is not None:
-            row |= true_columns(hand.truth())
+            worst = max(worst, hand.worst["range [rad]"])
+            row |= true_columns(hand, self._floor(hand, felt))
+        row["limit_violation"] = worst
         return row
+
+    def _floor(self, hand: SimulatedHand, felt: Grasp | Missed) -> tuple[float, float] | None:
+        """ε_f and ε_m that this grasp would be felt with, were it balanced."""
+        if isinstance(felt, Missed) or self.physics is None:
+            return None
+        away = np.linalg.norm(felt.positions - felt.positions.mean(axis=0), axis=1)
+        reach, radius = float(np.sqrt((away**2).mean())), float(hand.robot.tip_radius.min())
+        return self.physics.imperfections.floor(PRESS, radius, reach, felt.k)
 
 
 def _about(step: Step) -> dict[str, object]:

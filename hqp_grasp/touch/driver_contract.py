@@ -73,17 +73,7 @@ class Rig:
         while left > 0.0 or not slices:
             slices.append(self.driver.wait(min(left, 0.5 * self.driver.limits.watchdog)))
             left -= 0.5 * self.driver.limits.watchdog
-
-        def joined(name: str) -> np.ndarray:
-            return np.concatenate([getattr(part, name) for part in slices])
-
-        return replace(
-            slices[-1],
-            time=joined("time"),
-            q=joined("q"),
-            velocity=joined("velocity"),
-            wrench=joined("wrench"),
-        )
+        return _joined(slices)
 
     def joint(self, j: int) -> str:
         """Name of an independent joint."""
@@ -126,11 +116,19 @@ def samples_come_at_the_stated_rate(rig: Rig) -> None:
 
 def joints_go_where_they_are_sent(rig: Rig) -> None:
     """After a move the readings are of its end, at once."""
-    rig.go(rig.free[0])
-    before = rig.wait(0.2).q[-1]
-    target = _around(rig, rig.free[0], TRAVEL)
-    arrived = rig.go(target).q[-1]
-    later = rig.wait(0.5).q[-1]
+    flexion = [j for joints in rig.robot.flexion for j in joints]
+    for joints in (flexion, range(rig.robot.n)):  # fingers alone are quick
+        rig.go(rig.free[0])
+        target = rig.free[0].copy()
+        target[joints] = _around(rig, target, TRAVEL)[joints]
+        before = rig.wait(0.2).q[-1]
+        arrived = rig.go(target, 0.3).q[-1]
+        _must_arrive(rig, before, target, arrived, rig.wait(0.5).q[-1])
+
+
+def _must_arrive(
+    rig: Rig, before: np.ndarray, target: np.ndarray, arrived: np.ndarray, later: np.ndarray
+) -> None:
     for j in range(rig.robot.n):
         asked = target[j] - before[j]
         if abs(asked) < 2.0 * NEAR or abs(arrived[j] - target[j]) < NEAR:
@@ -338,8 +336,24 @@ def _must_stand(rig: Rig, q: np.ndarray, about: str) -> None:
 
 
 def _until_touched(rig: Rig) -> Readings:
-    readings, left = rig.wait(0.1), PATIENCE
-    while not readings.touched.all() and not readings.fault and left > 0.0:
-        readings = rig.wait(0.1)
+    """All readings until every finger has touched, or PATIENCE ends."""
+    slices, left = [rig.wait(0.1)], PATIENCE
+    while not slices[-1].touched.all() and not slices[-1].fault and left > 0.0:
+        slices.append(rig.wait(0.1))
         left -= 0.1
-    return readings
+    return _joined(slices)
+
+
+def _joined(slices: list[Readings]) -> Readings:
+    """One after the other, in one; flags are those of the end."""
+
+    def series(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name) for part in slices])
+
+    return replace(
+        slices[-1],
+        time=series("time"),
+        q=series("q"),
+        velocity=series("velocity"),
+        wrench=series("wrench"),
+    )

@@ -16,9 +16,12 @@ from hqp_grasp.world.robot import Robot
 
 GRAVITY = np.array([0.0, 0.0, -9.81])  # [m/s²] world
 OPENING = 0.3  # [s] at least, each ramp
-MOVING = 0.3
+MOVING = 0.4
 RESTING = 0.1  # [s] before the tips are weighed
-WEIGHING = 0.1  # [s]
+LISTENING = 0.05  # [s] to the sensors, before each move
+DEAF = 2.0  # [s] that a silent sensor is waited for
+PAUSE = 1.0  # [s] before a hand that did not open tries again
+WEIGHING = 0.2  # [s]
 SWIFT = 1.0  # [rad/s] of closing, far from the touch that is expected
 CAREFUL = 0.2  # [rad/s] near it
 SLOW = 0.3  # [rad/s] where nothing is known
@@ -27,8 +30,9 @@ NOTICED = 0.1  # [N] that counts as touch
 POLL = 0.1  # [s] between looks at the fingers while they close
 PATIENCE = 3.0  # [s] that closing may take beyond what its range and speed need
 SETTLING, PRESSING = 0.3, 0.3  # [s], [s/N] that the held force may take: a finger may slide
+PRESSED = 0.1  # [s] of readings that tell whether it is settled
 SETTLED = 0.04  # share of it that may be missing
-SENSING = 0.1  # [s] of readings that are averaged
+SENSING = 0.2  # [s] of readings that are averaged
 LOST = 0.5  # share of the held force below which a contact is none
 SPIKE = 0.5  # share of the held force by which a sample lies beside the others, to count as none
 STEEP = 1.5  # [–] tangential by normal force that no fingertip holds
@@ -79,26 +83,51 @@ class PhysicalProbe:
         flexion = np.array([j for (j,) in self.robot.flexion])
         expected = away[flexion]
         away[flexion] = np.maximum(self.driver.limits.lower[flexion], expected - RETREAT)
-        opened = self._opened(away)
+        heard = self._listen()
+        if isinstance(heard, Missed):
+            return heard
+        opened = self._opened(heard, away)
         felt = self._touch(opened, away, expected)
         if isinstance(felt, Missed):
-            self._go(self._opened(away), OPENING)
+            if felt.reason is Miss.STUCK:
+                self._watch(self.driver, PAUSE)
+            here = self.driver.wait(0.0)
+            back = self._opened(here, away)
+            # Nobody knows what a finger is at: it may be behind the object.
+            self._go(back, 2.0 * float(np.abs(back - here.q[-1]).max()) / SWIFT)
             self._go(opened, MOVING)
         return felt
 
-    def _opened(self, away: np.ndarray) -> np.ndarray:
+    def _listen(self) -> Readings | Missed:
+        """The newest readings, once no sensor is silent: a hand that feels nothing stays."""
+        left = DEAF
+        while True:
+            heard = self.driver.wait(LISTENING)
+            silent = _silent(heard)
+            left -= LISTENING
+            if not silent.any() or silent.all():
+                return heard
+            if left <= 0.0:
+                names = [point.name for point in self.robot.description.contact_points]
+                return Missed(Miss.SENSOR, names[int(silent.argmax())])
+
+    def _opened(self, readings: Readings, away: np.ndarray) -> np.ndarray:
         """Where the hand is, each finger opened by RETREAT, and at least as far as in `away`."""
         limits, flexion = self.driver.limits, [j for (j,) in self.robot.flexion]
-        q = np.clip(self.driver.wait(0.0).q[-1], limits.lower, limits.upper)
+        q = np.clip(readings.q[-1], limits.lower, limits.upper)
         opened = np.minimum(q[flexion] - RETREAT, away[flexion])
         q[flexion] = np.maximum(limits.lower[flexion], opened)
         return q
 
     def _touch(self, opened: np.ndarray, away: np.ndarray, expected: np.ndarray) -> Grasp | Missed:
-        for q, duration in ((opened, OPENING), (away, MOVING)):
+        for q, duration, reason in (
+            (opened, OPENING, Miss.STUCK),
+            (away, MOVING, Miss.BLOCKED),
+        ):
             fault = self._go(q, duration)
             if fault:
-                return Missed(Miss.BLOCKED, fault)
+                heard = self._listen()
+                return heard if isinstance(heard, Missed) else Missed(reason, fault)
         self.driver.wait(RESTING)
         free = self.driver.wait(WEIGHING)
         missed = self._close(free, expected)
@@ -115,11 +144,13 @@ class PhysicalProbe:
         left, weighed = SETTLING + PRESSING * self.force, self._steady(free)[:, :3]
         best, most = None, -1.0
         while best is None or left > 0.0:
-            held = self.driver.wait(SENSING)
-            left -= SENSING
+            held = self.driver.wait(PRESSED)
+            left -= PRESSED
             pressed = np.linalg.norm(self._steady(held)[:, :3] - weighed, axis=1)
-            if (np.abs(pressed - self.force) <= SETTLED * self.force).all() or held.fault:
+            if held.fault:
                 return held
+            if (np.abs(pressed - self.force) <= SETTLED * self.force).all():
+                return self.driver.wait(SENSING)
             if pressed.min() > most:
                 best, most = held, float(pressed.min())
         return best

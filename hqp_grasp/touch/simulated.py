@@ -29,6 +29,7 @@ SPIN_FRICTION = 0.02  # [m] torque about the normal that a contact transmits, by
 SAMPLING = 0.01  # [s] between readings
 PEAK = 1.875  # a minimum-jerk ramp's fastest speed, by its mean
 SPEED_SHARE = 0.8  # of a joint's speed limit that a move is planned with
+CARRY_SPEED = 0.12  # [m/s] at which the arm carries the tips: a bump stays below the force limit
 CLOSING_ACCELERATION = 20.0  # [rad/s²]
 STALL = 0.015  # [rad] a closing joint stays behind its target by, beyond the servo's own lag
 FOLLOWING = 0.05  # [rad] beside its target at which a joint is held by something: the hand stops
@@ -37,6 +38,10 @@ FORCE_GAIN = 0.5  # share of the force's error that one cycle of holding takes a
 HOLDING_SPEED = 0.3  # [rad/s] that holding corrects by, at most
 LEAD = 2.0  # times the servo's give at the held force, by which a target leads its joint at most
 GUARD = 0.6  # share of the force limit at which the driver stops
+MARGIN = 5e-3  # [rad] from the ends of its range a joint turns back: servos swing over
+BRAKING = 0.06  # [s] a stop takes, all joints together: one that stands while others move may press
+SILENT = 5  # samples of the fast loop, the same to the last bit, after which a sensor is dead
+STARTLE = 1.0  # [N] more than at its beginning, a move in free air stops: a bump has momentum
 PRESS = 0.4  # share of the force limit that is held, at most
 MOVING, REACTING = 0.4, 0.05  # [s] in one call of the simulator, and while fingers press
 IDLE, CLOSING, HOLDING = 0, 1, 2
@@ -142,11 +147,11 @@ class SimulatedHand:
         self.limits = DriverLimits(
             robot.q_lower, robot.q_upper, robot.velocity, torque, force_limit, watchdog
         )
+        self._lower, self._upper = robot.q_lower + MARGIN, robot.q_upper - MARGIN
         self.rate = 1.0 / (self._every * timestep)
         self._rng = rng or np.random.default_rng(0)
-        self._errors = SensorErrors(
-            about, k, np.isin(robot.joints, robot.description.arm), self._rng
-        )
+        self._arm = np.isin(robot.joints, robot.description.arm)
+        self._errors = SensorErrors(about, k, self._arm, self._rng)
         self._late = round(about.latency / timestep)
         self.simulated = 0  # steps in all
         # The largest of each since the hand was made, at any step.
@@ -162,15 +167,14 @@ class SimulatedHand:
         InputError where it is in the object all the same.
         """
         robot, model, data = self.robot, self.model, self._data
-        q = robot.require_q("SimulatedHand.place: q", q).copy()
-        q[self._flexion] = np.maximum(self.limits.lower[self._flexion], q[self._flexion] - RETREAT)
+        q = np.clip(robot.require_q("SimulatedHand.place: q", q), self._lower, self._upper)
+        q[self._flexion] = np.maximum(self._lower[self._flexion], q[self._flexion] - RETREAT)
         if self._put(q):
-            q[self._flexion] = self.limits.lower[self._flexion]
+            q[self._flexion] = self._lower[self._flexion]
             inside = self._put(q)
             if inside:
                 raise InputError(
-                    f"SimulatedHand.place: {inside} is in the object, with open fingers; "
-                    "begin further away from it"
+                    f"SimulatedHand.place: {inside}, with open fingers; begin further away from it"
                 )
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
         self._state = np.zeros(mujoco.mj_stateSize(model, kind))
@@ -179,6 +183,8 @@ class SimulatedHand:
         self._goal = q.copy()  # (n,) [rad] the commanded posture, as encoders have it
         self._play = q.copy()  # (n,) [rad] what the joints are told of it
         self._ramp: tuple[np.ndarray, np.ndarray, int, int] | None = None  # from, to, step, steps
+        self._going = np.zeros(len(q))  # (n,) [rad/s] of the goal
+        self._braking = 0  # steps left
         k = len(self._tips)
         self._mode = [IDLE] * k
         self._speed = [0.0] * k  # [rad/s] asked
@@ -188,13 +194,14 @@ class SimulatedHand:
         self._give = [0.0] * k  # [rad/N] of the servo at the tip
         self._zero = np.zeros((k, 3))  # [N] at the call of `close`
         self._touched, self._stalled = np.zeros(k, bool), np.zeros(k, bool)
+        self._guard = np.full(k, GUARD * self.limits.force)  # [N] at which the hand stops
         self._fault = ""
         still = -data.sensordata[self._wrench].reshape(1, k, 6)
         self._tail = np.repeat(still, self._late, axis=0)
         self._last = self._errors.wrench(np.zeros(1), still)  # the newest samples
 
     def _put(self, q: np.ndarray) -> str:
-        """Put hand and object in their places; return the hand's geom that is in the object."""
+        """Put hand and object in their places; return which of its geoms is in what, if any."""
         robot, model, data = self.robot, self.model, self._data
         mujoco.mj_resetData(model, data)
         data.qpos[self._all] = robot.coupling @ q + robot.offset
@@ -202,10 +209,10 @@ class SimulatedHand:
         mujoco.mj_forward(model, data)
         for contact in data.contact[: data.ncon]:
             one, other = contact.geom.tolist()
-            touching = other if one in self._objects else one
-            felt = self._objects & {one, other} and touching in self._hand
-            if felt and contact.dist < 0.0:
-                return model.geom(touching).name
+            hand = self._hand & {one, other}
+            if len(hand) == 1 and contact.dist < 0.0:
+                met = "object" if self._objects & {one, other} else "support"
+                return f"{model.geom(*hand).name} is in the {met}"
         return ""
 
     def truth(self) -> Truth:
@@ -269,11 +276,16 @@ class SimulatedHand:
         """See Driver."""
         q = self.robot.require_q("SimulatedHand.move: q", q)
         positive("SimulatedHand.move: duration", duration)
-        to = np.clip(q + self._errors.miss(len(q)), self.limits.lower, self.limits.upper)
-        least = PEAK * np.abs(to - self._goal) / (SPEED_SHARE * self.limits.speed)
-        steps = int(np.ceil(max(duration, least.max()) / self._dt))
-        self._ramp = (self._goal.copy(), to, 0, steps)
+        to = np.clip(q + self._errors.miss(len(q)), self._lower, self._upper)
+        least = np.abs(to - self._goal) / (SPEED_SHARE * self.limits.speed)
+        carried = np.where(self._arm, to - self._goal, 0.0)
+        path = [self.robot.centers(self._goal + s * carried) for s in (0.0, 0.5, 1.0)]
+        way = np.linalg.norm(np.diff(path, axis=0), axis=2).sum(axis=0)
+        least = PEAK * max(least.max(), way.max() / CARRY_SPEED)
+        steps = int(np.ceil(max(duration, least) / self._dt))
+        self._ramp, self._braking = (self._goal.copy(), to, 0, steps), 0
         self._rest()
+        self._guard = np.minimum(self._guard, np.linalg.norm(self._middle(), axis=1) + STARTLE)
         self._fault = ""
         return steps * self._dt
 
@@ -284,7 +296,8 @@ class SimulatedHand:
         positive("SimulatedHand.close: speed", speed)
         positive("SimulatedHand.close: force", force)
         self._fault = ""
-        self._ramp = None
+        self._ramp, self._braking = None, 0
+        self._guard[:] = GUARD * self.limits.force
         j = self._flexion[finger]
         if self._mode[finger] != CLOSING:
             self._zero[finger] = self._middle()[finger]
@@ -303,10 +316,15 @@ class SimulatedHand:
 
     def stop(self) -> None:
         """See Driver."""
+        if self._going.any() and not any(self._mode):
+            self._braking = self._braking or round(BRAKING / self._dt)
         self._ramp = None
         self._rest()
-        q = self._state[1 + self._q]
-        self._goal = np.clip(self._errors.joints(q), self.limits.lower, self.limits.upper)
+        if not self._braking:
+            self._stand()
+
+    def _stand(self) -> None:
+        self._goal = np.clip(self._measured(), self._lower, self._upper)
 
     def wait(self, duration: float) -> Readings:
         """See Driver."""
@@ -343,6 +361,8 @@ class SimulatedHand:
     # ------------------------------------------------------------ the fast loop
 
     def _chunk(self) -> int:
+        if self._braking:
+            return self._braking
         return math.ceil((REACTING if any(self._mode) else MOVING) / self._dt)
 
     def _plan(self, T: int) -> np.ndarray:
@@ -356,6 +376,9 @@ class SimulatedHand:
             goal = start + (end - start) * (s * s * s * (10.0 + s * (6.0 * s - 15.0)))
             speed = (end - start) * (30.0 * (s * (1.0 - s)) ** 2 / (steps * self._dt))
             self._ramp = (start, end, step + T, steps) if step + T < steps else None
+        if self._braking:
+            speed = self._going * np.maximum(1.0 - after / self._braking, 0.0)[:, None]
+            goal += speed.cumsum(axis=0) * self._dt
         closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
         if closing:
             j = self._flexion[closing]
@@ -363,7 +386,7 @@ class SimulatedHand:
             gain = (CLOSING_ACCELERATION * self._dt * after)[:, None]
             v = now + np.minimum(np.maximum(wanted - now, -gain), gain)
             speed[:, j] = v
-            goal[:, j] = np.minimum(goal[0, j] + v.cumsum(axis=0) * self._dt, self.limits.upper[j])
+            goal[:, j] = np.minimum(goal[0, j] + v.cumsum(axis=0) * self._dt, self._upper[j])
         if HOLDING in self._mode:
             felt = self._middle() - self._zero
             q, share = self._measured(), after / T
@@ -396,8 +419,8 @@ class SimulatedHand:
         now = float(self._goal[j])
         goal = now + _within(wanted, HOLDING_SPEED * T * self._dt)
         # However little a broken sensor says, the servo's own error bounds the force.
-        most = min(q + LEAD * give * self._force[i] + STALL, float(self.limits.upper[j]))
-        return max(min(goal, most), float(self.limits.lower[j])) - now
+        most = min(q + LEAD * give * self._force[i] + STALL, float(self._upper[j]))
+        return max(min(goal, most), float(self._lower[j])) - now
 
     def _run(self, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Simulate; states (T, ·) after each step, and sensors (T, ·) during it."""
@@ -425,9 +448,10 @@ class SimulatedHand:
         goal, speed, told = self._planned
         first, what = T, None  # what happens at the end of step `first`, if anything
         force = wrench[:, :, :3]
-        square, guard = _squares(force), (GUARD * self.limits.force) ** 2
-        if square.max() > guard:
-            over = _twice(square > guard)
+        square = _squares(force)
+        above = square > self._guard**2
+        if above.any():
+            over = _twice(above)
             if over.any():
                 first = int(np.argmax(over.any(axis=1)))
                 what = ("guard", int(np.argmax(over[first])))
@@ -442,6 +466,15 @@ class SimulatedHand:
                 if happens[:first].any():
                     first = int(np.argmax(happens.any(axis=1)))
                     what = (kind, closing[int(np.argmax(happens[first]))])
+        if not any(self._mode) and speed.any():
+            dead = (wrench[1:] == wrench[:-1]).all(axis=2)
+            for _ in range(SILENT - 2):
+                dead = dead[1:] & dead[:-1]
+            alone = dead.any(axis=1) & ~dead.all(axis=1)  # at the first of SILENT samples
+            if alone[: max(0, first - SILENT + 1)].any():
+                first = int(np.argmax(alone))
+                what = ("silent", int(np.argmax(dead[first])))
+                first += SILENT - 1
         beside = np.abs(behind)
         if beside[:first].max(initial=0.0) > FOLLOWING:
             first = int(np.argmax((beside > FOLLOWING).any(axis=1)))
@@ -449,6 +482,12 @@ class SimulatedHand:
         done = min(first + 1, T)
         self._goal = goal[done - 1].copy()
         self._play = told[done - 1].copy()
+        self._going = speed[done - 1].copy()
+        if self._braking:
+            self._braking = max(0, self._braking - done)
+            if not self._braking:
+                self._state = state[done - 1].copy()
+                self._stand()
         for i in range(len(self._mode)):
             self._now[i] = float(speed[done - 1, self._flexion[i]])
         if what is None:
@@ -457,11 +496,16 @@ class SimulatedHand:
         self._state = state[done - 1].copy()
         if kind == "held":
             self.stop()
-            self._fault = f"something holds {self.robot.joints[i]}: it does not follow"
-        elif kind == "guard":
+            held = f"something holds {self.robot.joints[i]}: it does not follow"
+            self._fault = self._fault or held
+        elif kind == "silent":
             name = self.robot.description.contact_points[i].name
             self.stop()
-            self._fault = f"contact force above {GUARD * self.limits.force:g} N at {name}"
+            self._fault = self._fault or f"the sensor of {name} does not answer"
+        elif kind == "guard":
+            name, most = self.robot.description.contact_points[i].name, self._guard[i]
+            self.stop()
+            self._fault = self._fault or f"contact force above {most:.2g} N at {name}"
         elif kind == "touch":
             self._begin_holding(i)
         else:
@@ -478,11 +522,11 @@ class SimulatedHand:
     def _begin_holding(self, i: int) -> None:
         j = self._flexion[i]
         q = self._measured()
-        J = self.robot.jacobian(np.clip(q, self.limits.lower, self.limits.upper))
+        J = self.robot.jacobian(np.clip(q, self._lower, self._upper))
         self._give[i] = float(np.linalg.norm(J[3 * i : 3 * i + 3, j]) / self._kp[j])
         self._mode[i], self._touched[i], self._now[i] = HOLDING, True, 0.0
         self._aim[i] = self._force[i]
-        self._goal[j] = min(q[j] + self._give[i] * self._force[i], self.limits.upper[j])
+        self._goal[j] = min(q[j] + self._give[i] * self._force[i], self._upper[j])
 
     def _measured(self) -> np.ndarray:
         return self._errors.joints(self._state[1 + self._q])
@@ -491,12 +535,13 @@ class SimulatedHand:
         self._mode = [IDLE] * len(self._mode)
         self._now = [0.0] * len(self._mode)
         self._touched, self._stalled = np.zeros_like(self._touched), np.zeros_like(self._stalled)
+        self._guard = np.full(len(self._mode), GUARD * self.limits.force)
 
     def _readings(
         self, states: np.ndarray, felt: np.ndarray, torques: np.ndarray, true: np.ndarray
     ) -> Readings:
         velocity = states[:, 1 + self.model.nq + self._v]
-        q = states[:, 1 + self._q]
+        q = self._errors.joints(states[:, 1 + self._q])
         outside = np.maximum(self.limits.lower - q.min(axis=0), q.max(axis=0) - self.limits.upper)
         speed = np.maximum(velocity.max(axis=0), -velocity.min(axis=0)) / self.limits.speed
         torque = np.maximum(torques.max(axis=0), -torques.min(axis=0)) / self.limits.torque
@@ -508,7 +553,7 @@ class SimulatedHand:
         at = slice(self._every - 1, None, self._every)
         return Readings(
             time=states[at, 0],
-            q=self._errors.joints(q[at]),
+            q=q[at],
             velocity=velocity[at],
             wrench=felt[at],
             touched=self._touched,

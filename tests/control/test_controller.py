@@ -135,7 +135,7 @@ def test_every_miss_has_a_reaction_and_an_end(robot, stack, first, reason):
         told.append(step.reason)
         if step.q_target is None:
             break
-        if reason is Miss.SENSOR:
+        if reason in (Miss.SENSOR, Miss.STUCK):
             np.testing.assert_array_equal(step.q_target, plain.q_target)
         elif reason in (Miss.OTHER_LINK, Miss.TABLE):
             palms = [robot.palm(q) for q in (first.q, step.q_target)]
@@ -148,12 +148,24 @@ def test_every_miss_has_a_reaction_and_an_end(robot, stack, first, reason):
             )
     *reactions, last = told
     assert last.endswith(f"misses from one grasp, the last: {reason.value} (finger_2)")
-    if reason is Miss.SENSOR:
+    if reason in (Miss.SENSOR, Miss.STUCK):
         assert reactions == ["the same again"] * 3
     elif reason in (Miss.OTHER_LINK, Miss.TABLE):
         assert reactions == [f"palm back by {10 * i} mm" for i in range(1, 6)]
     else:
         assert reactions == ["0.5 of the step", "0.25 of the step"]
+
+
+@pytest.mark.parametrize("reason", Miss)
+def test_the_first_touch_is_tried_again_where_what_ails_it_may_pass(robot, stack, first, reason):
+    controller, missed = Controller(robot, stack), Touch(first.q, Missed(reason, "finger_1"))
+    step = controller.step([missed])
+    if reason in (Miss.SENSOR, Miss.STUCK, Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR):
+        np.testing.assert_array_equal(step.q_target, first.q)
+        assert step.reason == "the same again"
+        assert controller.step([missed] * 4).q_target is None
+    else:
+        assert step.q_target is None
 
 
 def test_a_sensor_that_comes_back_costs_no_share_of_the_step(robot, stack, first):

@@ -1,6 +1,7 @@
 """The physical probe: what it feels is what is there, and what goes wrong is told by its reason."""
 
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import hqp_grasp as hg
+from hqp_grasp.experiments.record import balanced
 from hqp_grasp.touch.imperfections import FAULTS, PRESETS, Fault, SensorErrors
 from hqp_grasp.touch.physical import payload, weight
 
@@ -162,6 +164,69 @@ def test_whenever_something_breaks_the_answer_is_a_grasp_or_a_miss_within_the_li
         assert error.max() < 1.0
 
 
+@pytest.mark.parametrize(("lower", "told"), [(0.046, True), (0.04, False)])
+def test_what_faces_up_at_the_tables_height_is_the_table(lower, told):
+    scene = hg.Scene(object=hg.Cylinder(0.05, height=0.1))  # its top stands for a table here
+    hand, q = hg.SimulatedHand(scene, links="pass"), POSTURE.copy()
+    q[1] -= lower
+    for table, met in ((0.25, told), (0.24, False)):
+        hand.place(q)
+        felt = hg.PhysicalProbe(hand, scene.articulated, table=table).touch(q)
+        assert (felt == hg.Missed(hg.Miss.TABLE, "finger_1")) if met else isinstance(felt, hg.Grasp)
+
+
+def test_a_hand_does_not_move_while_a_sensor_is_silent(scene):
+    fault = Fault("dropout", finger=2, begin=0.2, duration=0.6)
+    hand = hg.SimulatedHand(scene, hg.Physics(imperfections=hg.Imperfections(faults=(fault,))))
+    hand.wait(0.3)
+    before, q = hand.wait(0.0).q[-1], hand.robot.home.copy()
+    q[:4] += 0.1
+    hand.move(q, 0.3)
+    silent = hand.wait(0.3)
+    assert silent.fault == "the sensor of finger_3 does not answer"
+    np.testing.assert_allclose(silent.q, np.tile(before, (len(silent.q), 1)), atol=1e-4)
+    hand.wait(0.3)
+    left = hand.move(q, 0.3)
+    while left > -0.2:
+        arrived = hand.wait(0.4)
+        left -= 0.4
+    assert arrived.fault == "" and np.abs(arrived.q[-1] - q).max() < 1e-2
+
+
+def test_a_silent_sensor_is_waited_for_but_not_for_ever(scene):
+    for duration, heard in ((1.0, True), (np.inf, False)):
+        fault = Fault("freeze", finger=0, begin=0.0, duration=duration)
+        physics = hg.Physics(imperfections=hg.Imperfections(faults=(fault,)))
+        _, felt = touch(scene, physics, links="pass")
+        assert isinstance(felt, hg.Grasp) if heard else felt.reason is hg.Miss.SENSOR
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bump_at_full_speed_stays_below_the_force_limit(scene, seed):
+    hand = hg.SimulatedHand(scene, links="pass")
+    hand.place(AWAY)
+    q = POSTURE.copy()
+    q[1] += 0.3
+    q[:7] += np.random.default_rng(seed).uniform(-0.1, 0.1, 7)
+    left, fault = hand.move(q, 0.1), ""
+    while left > 0.0 and not fault:
+        fault = hand.wait(0.5).fault
+        left -= 0.5
+    assert "at finger_" in fault or "does not follow" in fault
+    assert 1.0 < hand.worst["force [N]"] < hand.limits.force
+    standing = hand.wait(0.3).velocity[-1]
+    assert np.abs(standing / hand.limits.speed).max() < 0.01
+
+
+def test_joints_stay_off_the_ends_of_their_ranges(scene):
+    hand = hg.SimulatedHand(scene, hg.Physics(imperfections=hg.Imperfections(servo_error=1e-3)))
+    for end in (hand.limits.lower, hand.limits.upper):
+        q = hand.robot.home.copy()
+        q[8:] = end[8:]
+        hand.wait(hand.move(q, 0.5) + 0.2)
+    assert hand.worst["range [rad]"] == 0.0
+
+
 # ---------------------------------------------------------------- imperfections
 
 
@@ -214,9 +279,8 @@ def test_the_floor_is_what_noise_makes_of_a_balanced_grasp():
     for _ in range(2000):
         net = np.zeros(3)
         for n in normals:
-            wrench = np.concatenate([n, np.zeros(3)])
-            wrench += np.repeat([0.02, 2e-4], 3) * rng.normal(size=6) / np.sqrt(10)
-            net += hg.sense(wrench, 0.008)[1]
+            held, weighed = rng.normal(size=(2, 6)) * np.repeat([0.02, 2e-4], 3) / np.sqrt(20)
+            net += hg.sense(np.concatenate([n, np.zeros(3)]) + held - weighed, 0.008)[1]
         eps.append(net @ net)
     floor, _ = about.floor(1.0, 0.008, 0.05)
     np.testing.assert_allclose(np.mean(eps), floor, rtol=0.1)
@@ -246,7 +310,7 @@ def test_backlash_keeps_a_joint_behind_by_half_the_play(scene):
 
 
 def trial(scene, preset=None):
-    return hg.Trial(scene, hg.stack_of("fmk"), 8, links="pass", probe="physical", preset=preset)
+    return hg.Trial(scene, hg.stack_of("fmk"), 12, links="pass", probe="physical", preset=preset)
 
 
 def test_a_trial_balances_the_grasp_by_touch_alone(scene):
@@ -269,6 +333,71 @@ def test_a_trial_is_the_same_to_the_last_bit_in_another_process(scene):
     ).run((3, 1))
     for one, same in zip(here.grasps, pickle.loads(other.stdout), strict=True):
         np.testing.assert_array_equal(one.q, same)
+
+
+RECOVERIES = {
+    "dropout": "the same again",
+    "freeze": "the same again",
+    "spike": None,
+    "stall": "palm back by 10 mm",
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_trial_goes_on_after_a_fault_and_its_rows_tell_how(scene, kind):
+    # The sensor is out as the fingers close for the first step; the joint is as the hand opens.
+    begin, lasts = (4.2, 0.002) if kind == "spike" else (4.2, 4.0)
+    about = hg.Imperfections(faults=(Fault(kind, 1, begin, lasts),))
+    broken = replace(trial(scene), probe=hg.Physics(imperfections=about))
+    record = broken.run((3, 1))
+    reactions = {row["reaction"] for row in record.rows} - {None}
+    assert RECOVERIES[kind] in (reactions or {None})
+    assert record.converged_at is not None
+    assert record.rows[-1]["peak_force"] < 15.0 and record.rows[-1]["peak_speed"] <= 1.0
+
+
+def test_an_object_that_is_knocked_away_is_given_up_with_a_reason(scene):
+    class Knocked:
+        """Takes the object away after the second touch."""
+
+        def __init__(self, hand):
+            self.hand, self.touches = hg.PhysicalProbe(hand, scene.articulated), 0
+
+        def touch(self, q_target):
+            self.touches += 1
+            if self.touches == 3:
+                free = self.hand.driver
+                free._state[1 + free.model.joint("object").qposadr[0] + 1] += 0.5
+            return self.hand.touch(q_target)
+
+    hand = hg.SimulatedHand(scene, hg.Physics(support="pedestal"), links="pass")
+    hand.place(POSTURE)
+    first = hg.PhysicalProbe(hand, scene.articulated).touch(POSTURE)
+    record = hg.Trial(scene, hg.stack_of("fmk"), 8, start=first).run(0, Knocked(hand))
+    ended = [row["outcome"] for row in record.rows if row["outcome"]]
+    assert re.match(r"gave up: \d misses from one grasp, the last: a finger", ended[-1])
+    assert [row["reaction"] for row in record.rows if row["reaction"]][-1] == "gave up"
+
+
+def test_where_noise_has_a_floor_balance_is_judged_by_it(scene):
+    record = trial(scene, "loadcell").run((3, 1))
+    plain = trial(scene).run((3, 1))
+    last, exact = record.rows[-1], plain.rows[-1]
+    assert exact["floor_f"] == exact["floor_m"] == 0.0
+    reach = np.linalg.norm(
+        record.grasps[-1].positions - record.grasps[-1].positions.mean(0), axis=1
+    )
+    floor = hg.Imperfections.preset("loadcell").floor(1.0, 0.008, np.sqrt((reach**2).mean()))
+    np.testing.assert_allclose((last["floor_f"], last["floor_m"]), floor)
+    rows = {
+        "eps_f": np.array([4.1, 3.9, 3.9, np.nan]) * floor[0],
+        "eps_m": np.array([3.9, 3.9, 4.1, 0.0]) * floor[1],
+        "floor_f": np.full(4, floor[0]),
+        "floor_m": np.full(4, floor[1]),
+    }
+    assert balanced(rows).tolist() == [False, True, False, False]
+    exactly = {name: rows[name] for name in ("eps_f", "eps_m")}
+    assert not balanced(exactly).any()
 
 
 def test_a_preset_needs_a_hand_that_can_be_imperfect(scene):

@@ -419,6 +419,7 @@ def test_every_reason_reads_as_one():
         "a fingertip began inside the object",
         "another link touches the object",
         "the hand stopped itself on the way",
+        "the hand does not open",
         "a finger closed onto the hand itself",
         "a fingertip met what the object stands on",
         "a contact was lost while the hand held",
