@@ -56,9 +56,15 @@ class Outcome:
         return float(np.argmax(kept)) if kept.any() else np.nan
 
 
-def trial_of(thing: object, probe: str | hg.Physics, probes: int, **settings: object) -> hg.Trial:
+def trial_of(
+    thing: object,
+    probe: str | hg.Physics,
+    probes: int,
+    robot: str = "wam_bhand",
+    **settings: object,
+) -> hg.Trial:
     """The paper's laws on one of OBJECTS."""
-    scene = hg.Scene(object=thing)
+    scene = hg.Scene(robot=robot, object=thing)
     stack = hg.stack_of("fmk").within(hg.StepLimit(), hg.ConfigurationLimit(scene.articulated))
     return hg.Trial(scene, stack, probes, probe=probe, **{"links": "pass", **settings})
 
@@ -161,6 +167,7 @@ def figure5(
     trials: int = 20,
     probes: int = 25,
     seed: int = 102,
+    robot: str = "umass_torso",
     timestep: float = 0.002,
     plot: Path = Path("out/figure5.png"),
 ) -> None:
@@ -168,8 +175,9 @@ def figure5(
     sets: dict[str, list[Outcome]] = {}
     for name, preset in (("noise-free", None), ("loadcell", "loadcell")):
         begin = time.process_time()
+        physics = hg.Physics(timestep=timestep)
         trial = trial_of(
-            OBJECTS["cylinder_65"], hg.Physics(timestep=timestep), probes, preset=preset
+            OBJECTS["cylinder_65"], physics, probes, robot, links="block", preset=preset
         )
         outcomes = run(trial, trials, seed)
         seconds = time.process_time() - begin
