@@ -37,7 +37,14 @@ PYTHON_ON = [
     "real-hand.md",
     "solver.md",
 ]
-COMMANDS_ON = ["looking.md", "many-trials.md", "objects.md", "quickstart.md", "real-hand.md", "results.md"]
+COMMANDS_ON = [
+    "looking.md",
+    "many-trials.md",
+    "objects.md",
+    "quickstart.md",
+    "real-hand.md",
+    "results.md",
+]
 SMALL = ["--probes", "2", "--jobs", "1"]  # in the place of what the page says, and so few trials
 ELSEWHERE = ("benchmarks/", "pytest", "ruff")  # what `make results`, `make test` run
 
@@ -69,7 +76,8 @@ def call(arguments, monkeypatch):
     elif arguments[0] == "view":
         arguments = [*arguments, "--port", "0"]
     monkeypatch.setattr(sys, "argv", [module, *arguments])
-    for name in [name for name in sys.modules if name.startswith("hqp_grasp.scenarios.")]:
+    started = ("hqp_grasp.__main__", "hqp_grasp.scenarios.")
+    for name in [name for name in sys.modules if name.startswith(started)]:
         monkeypatch.delitem(sys.modules, name)  # a command starts afresh
     runpy.run_module(module, run_name="__main__")
 
