@@ -85,6 +85,7 @@ def call(arguments, monkeypatch):
 def interrupted(viewer):
     raise KeyboardInterrupt
 
+
 NEEDS = {  # what a page shows beyond what hqp_grasp needs, and the extra that installs it
     "looking.md": {"viser": "view"},
     "many-trials.md": {"pandas": "read", "duckdb": "read"},
