@@ -88,7 +88,7 @@ def interrupted(viewer):
 
 NEEDS = {  # what a page shows beyond what hqp_grasp needs, and the extra that installs it
     "looking.md": {"viser": "view"},
-    "many-trials.md": {"pandas": "read", "duckdb": "read"},
+    "many-trials.md": {"pandas": "read", "duckdb": "read", "viser": "view"},
 }
 
 
@@ -103,7 +103,7 @@ def test_what_a_page_shows_runs_and_prints_what_the_page_says(page, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     for package, extra in NEEDS.get(page, {}).items():
         pytest.importorskip(package, reason=f"the page is about the extra hqp_grasp[{extra}]")
-    if page == "looking.md":
+    if any("view" in arguments for arguments in calls(page)):
         monkeypatch.setattr("hqp_grasp.experiments.view.Viewer.play", interrupted)
     names = {"__name__": "__main__"}  # a page's later blocks go on from its earlier ones
     for kind, file, code, shown in BLOCKS[page]:
