@@ -97,21 +97,21 @@ def main(
     print(f"cylinder of 5 cm, {joint} within ±{half_width} rad of its start, seed {seed}, {solver}")
     print(f"{trials} trials of {probes} probes, a limit active in {active} of {taken} steps")
     print(f"\nforce left by one step [N], over the {len(left['hierarchy'])} grasps felt")
-    print(f"{'':12}{'median':>10}{'max':>10}{'more than hierarchy':>22}{'outside [rad]':>16}")
+    print(f"{'':16}{'median':>10}{'max':>10}{'more than hierarchy':>22}{'outside [rad]':>16}")
     least = np.array(left["hierarchy"])
     for name, values in left.items():
         more = np.mean(np.array(values) > least + WORSE)
         share = "–" if name == "hierarchy" else f"{more:.1%}"
-        row = f"{name:12}{np.median(values):10.1e}{max(values):10.1e}"
+        row = f"{name:16}{np.median(values):10.1e}{max(values):10.1e}"
         print(f"{row}{share:>22}{outside[name]:16.1e}")
     print(f"\nlargest violation felt in the hierarchy's trials: {felt_outside:g} rad")
     print(f"\nafter {probes} probes in each form")
-    print(f"{'':12}{'median √ε_f [N]':>18}{'max':>10}{'lost':>8}")
+    print(f"{'':16}{'median √ε_f [N]':>18}{'max':>10}{'lost':>8}")
     for form, records in runs.items():
         ends = [np.sqrt(r.rows[-1]["eps_f"]) for r in records if not r.lost]
         lost = sum(record.lost for record in records)
         middle, worst = (np.median(ends), max(ends)) if ends else (np.nan, np.nan)
-        print(f"{form:12}{middle:18.1e}{worst:10.1e}{lost:8}")
+        print(f"{form:16}{middle:18.1e}{worst:10.1e}{lost:8}")
 
 
 if __name__ == "__main__":

@@ -111,7 +111,7 @@ def main(
     starts: int = 50,
     probes: int = 40,
     seed: int = 0,
-    form: str = "memory",
+    form: str = "hierarchy",
     noise: bool = False,
     jobs: int = 2,
 ) -> None:

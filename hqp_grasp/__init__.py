@@ -1,7 +1,7 @@
 """Grasping by touch, with control laws in strict order and within a robot's limits."""
 
 from hqp_grasp.control.controller import Controller, Step
-from hqp_grasp.control.forms import ClippedForm, HierarchyForm, PaperForm
+from hqp_grasp.control.forms import ClippedForm, HierarchyForm, MemorylessForm, PaperForm
 from hqp_grasp.control.ik import ik_levels, solve_ik
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
 from hqp_grasp.errors import (
@@ -72,6 +72,7 @@ __all__ = [
     "Level",
     "LevelReport",
     "Limit",
+    "MemorylessForm",
     "MinkLimit",
     "Miss",
     "Missed",

@@ -48,6 +48,17 @@ class Step:
         return None if self.plan is None else self.plan.solution
 
 
+@dataclass(frozen=True, eq=False)
+class _Stand:
+    """Where a history leaves the hand."""
+
+    grasp: Grasp | None = None  # to step from
+    misses: tuple[Missed, ...] = ()  # of steps from it
+    since: int | None = None  # touches since the hand began again from its first grasp
+    lost: bool = False  # nothing felt since then
+    way: tuple[np.ndarray, ...] = ()  # postures (n,) [rad] back to the grasp
+
+
 @dataclass(frozen=True)
 class Controller:
     """Laws within limits, as a rule for the next touch: no scene and no probe are needed.
@@ -55,19 +66,20 @@ class Controller:
     `step(history)` is a pure function of what was felt: nothing is remembered between calls, so a
     run can be stopped, stored (`save_history`) and resumed anywhere.
 
-    form="hierarchy" solves the joint-space hierarchy within its limits; "clipped" takes the strict
-    projection of the same laws, scaled to the caps and clipped to the ranges; "paper" composes
-    gradients in contact space and maps them by the SR-inverse (eq. 11–13), then clips likewise;
-    "paper-hierarchy" puts the paper's two levels strictly below the limits; "memory" is the
-    hierarchy with laws that know all that was felt, for objects with flat faces and edges. A `Form`
-    of one's own stands in the place of these names. A stack without caps gets StepLimit(), one
-    without ranges the robot's.
+    form="hierarchy" solves the laws as a strict hierarchy in joint space within its limits, force
+    and moment led by all that was felt; "memoryless" is the same by the last grasp alone; "clipped"
+    takes the strict projection of its laws, scaled to the caps and clipped to the ranges; "paper"
+    composes gradients in contact space and maps them by the SR-inverse (eq. 11–13), then clips
+    likewise; "paper-hierarchy" puts the paper's two levels strictly below the limits. A `Form` of
+    one's own stands in the place of these names. A stack without caps gets StepLimit(), one without
+    ranges the robot's.
 
     After a miss the step is taken again from the last grasp, shorter: SHARES of it in turn. Where
     another link than the fingertips met the object, or a fingertip the table, the palm withdraws on
     the next step, by RETREAT more at each such miss. Where a sensor was silent, or the hand did not
-    open, the same step is tried again. Then, or once the `budget` of touches is spent, the
-    controller gives up.
+    open, the same step is tried again. When nothing is left to try, "hierarchy" begins again from
+    its first grasp, with careful steps. Where that brings no touch either, and for the other forms
+    at once, or when the `budget` of touches is spent, the controller gives up.
     """
 
     robot: Robot
@@ -104,43 +116,64 @@ class Controller:
 
         Raises InputError for an empty history, or one that is not of this robot.
         """
-        grasp, misses = self._latest(history)
+        stand = self._stand(history)
+        grasp, misses = stand.grasp, stand.misses
         if grasp is None and misses[-1].reason in PASSING and len(misses) < MAX_BROKEN:
             return Step(history[0].q_target, reason="the same again")
         if grasp is None:
             return Step(None, reason="no touch has felt a grasp yet: begin where the hand touches")
         if self.budget is not None and len(history) >= self.budget:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
-        blocked = sum(missed.reason in IN_THE_WAY for missed in misses)
-        broken = sum(missed.reason in BROKEN for missed in misses)
-        short = len(misses) - blocked - broken
-        shares = getattr(self.form, "shares", SHARES)
-        if short == len(shares) or blocked == MAX_RETREATS or broken == MAX_BROKEN:
+        if self._spent(misses):
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
+        in_the_way = [missed.reason in IN_THE_WAY for missed in misses]
+        retreat = RETREAT * [*in_the_way[::-1], False].index(False)
         stack: Stack = self.stack  # type: ignore[assignment]
-        if blocked:
-            stack = stack.within(RetreatLimit(self.robot, blocked * RETREAT))
+        if retreat > 0.0:
+            stack = stack.within(RetreatLimit(self.robot, retreat))
         left = None if self.budget is None else self.budget - len(history)
-        plan = self.form.plan(stack, grasp, history, left)  # type: ignore[union-attr]
-        x = (1.0 if plan.exact else shares[short]) * plan.x
+        careful = {}  # a form that never begins again need not know the word
+        if stand.since is not None and stand.since < self._careful_for:
+            careful["careful"] = True
+        plan = self.form.plan(stack, grasp, history, left, **careful)  # type: ignore[union-attr]
+        short = _short(misses)
+        x = (1.0 if plan.exact else self._shares[short]) * plan.x
         if self.landing and not plan.exact:
             x = land(self.robot, stack, grasp, x)
         reactions = {
-            f"palm back by {1e3 * blocked * RETREAT:g} mm": blocked,
-            f"{shares[short]:g} of the step": short,
-            "the same again": broken and misses[-1].reason in BROKEN,
+            "from the first grasp again": stand.since == 0,
+            f"palm back by {1e3 * retreat:g} mm": retreat > 0.0,
+            f"{self._shares[short]:g} of the step": short,
+            "the same again": misses and misses[-1].reason in BROKEN,
         }
         reason = ", ".join(what for what, done in reactions.items() if done)
-        return Step(self._clipped(grasp, x), (), plan, shares[short], reason)
+        return Step(self._clipped(grasp, x), stand.way, plan, self._shares[short], reason)
 
-    def _latest(self, history: Sequence[Touch]) -> tuple[Grasp | None, list[Missed]]:
-        """The last grasp felt, and the misses since."""
+    @property
+    def _shares(self) -> tuple[float, ...]:
+        return getattr(self.form, "shares", SHARES)
+
+    @property
+    def _careful_for(self) -> int:
+        return getattr(self.form, "careful_for", 0)
+
+    def _spent(self, misses: Sequence[Missed]) -> bool:
+        """Whether nothing is left to try from a grasp after these misses."""
+        return (
+            _short(misses) == len(self._shares)
+            or sum(missed.reason in IN_THE_WAY for missed in misses) == MAX_RETREATS
+            or sum(missed.reason in BROKEN for missed in misses) == MAX_BROKEN
+        )
+
+    def _stand(self, history: Sequence[Touch]) -> _Stand:
+        """Where all touches so far leave the hand."""
         if not len(history):
             raise InputError("the history is empty: it begins with the first touch")
-        misses: list[Missed] = []
-        for touch in reversed(history):
+        grasps: list[Grasp] = []
+        stand = _Stand()
+        for touch in history:
             if not isinstance(touch, Touch):
                 raise InputError(f"a history holds Touch values; got {touch!r}")
             if len(touch.q_target) != self.robot.n:
@@ -148,10 +181,19 @@ class Controller:
                     f"a touch has {len(touch.q_target)} joints, {self.robot} has {self.robot.n}: "
                     "is it of another robot?"
                 )
+            since = None if stand.since is None else stand.since + 1
             if isinstance(touch.felt, Grasp):
-                return touch.felt, misses[::-1]
-            misses.append(touch.felt)
-        return None, misses[::-1]
+                grasps.append(touch.felt)
+                stand = _Stand(touch.felt, (), since)
+                continue
+            misses = (*stand.misses, touch.felt)
+            unlucky = self._spent(misses) and touch.felt.reason not in BROKEN
+            if self._careful_for and grasps and not stand.lost and unlucky:
+                way = tuple(grasp.q for grasp in reversed(grasps[:-1]))
+                stand = _Stand(grasps[0], (), 0, True, way)
+            else:
+                stand = _Stand(stand.grasp, misses, since, stand.lost)
+        return stand
 
     def _clipped(self, grasp: Grasp, x: np.ndarray) -> np.ndarray:
         """q + x within the ranges, as the very last act: only rounding may be cut."""
@@ -167,3 +209,8 @@ class Controller:
             worst = np.abs(clipped - q).max()
             raise HqpGraspError(f"a step left its range by {worst} rad: please report this")
         return np.where(left, q, clipped)  # a joint that started outside may still be on its way
+
+
+def _short(misses: Sequence[Missed]) -> int:
+    """How many misses found nothing, for which the step gets shorter."""
+    return sum(missed.reason not in IN_THE_WAY + BROKEN for missed in misses)

@@ -10,17 +10,18 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from hqp_grasp.control.aim import Aim
-from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, cap_ratio, cap_room
+from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, cap_ratio
 from hqp_grasp.control.memory import SurfaceMemory
-from hqp_grasp.control.paper import laws, paper_levels
+from hqp_grasp.control.paper import laws, paper_levels, why_not
 from hqp_grasp.control.settling import way_back
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level, Solution
 from hqp_grasp.hierarchy.projection import Projection
-from hqp_grasp.tasks import ForceTask, MomentTask, Priority, Stack
+from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Priority, Stack
 
+LEANING = 0.25 * np.pi  # [rad] mean angle of fingers to normals, above which they push aside
 RECENT = 10  # touches, whose misses make the hand aim elsewhere
 TRIED = 4  # aims, at most
 REACHED = 0.1  # [–] share of the way that may be missing, or the next aim is tried
@@ -51,18 +52,25 @@ class Form(Protocol):
         ...
 
     def plan(
-        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+        self,
+        stack: Stack,
+        grasp: Grasp,
+        history: Sequence[Touch] = (),
+        left: int | None = None,
+        careful: bool = False,
     ) -> Plan:
         """The step x = Δq that the laws ask for, within the limits.
 
-        `grasp` is the last felt; `history` is all that was felt, for a form that remembers.
+        `grasp` is the one to step from, the last felt; `history` is all that was felt, for a form
+        that remembers; `left` is how many more touches there may be. `careful` asks for a surer
+        step, even if it is a shorter one: the hand was lost and begins again.
         """
         ...
 
 
 @dataclass(frozen=True)
-class HierarchyForm:
-    """Limits and laws as one strict hierarchy in joint space, solved at once.
+class MemorylessForm:
+    """Limits and laws of the last grasp as one strict hierarchy in joint space, solved at once.
 
     Where the step that the laws would take without limits is too long for the caps, all of them
     ask for the same share of it. Caps alone would give the first law all that they allow, joint by
@@ -75,7 +83,12 @@ class HierarchyForm:
         """Every stack has this form."""
 
     def plan(
-        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+        self,
+        stack: Stack,
+        grasp: Grasp,
+        history: Sequence[Touch] = (),
+        left: int | None = None,
+        careful: bool = False,
     ) -> Plan:
         return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
 
@@ -93,7 +106,12 @@ class PaperHierarchyForm:
         laws(stack)
 
     def plan(
-        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+        self,
+        stack: Stack,
+        grasp: Grasp,
+        history: Sequence[Touch] = (),
+        left: int | None = None,
+        careful: bool = False,
     ) -> Plan:
         return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
 
@@ -108,7 +126,12 @@ class ClippedForm:
         """Every stack has this form."""
 
     def plan(
-        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+        self,
+        stack: Stack,
+        grasp: Grasp,
+        history: Sequence[Touch] = (),
+        left: int | None = None,
+        careful: bool = False,
     ) -> Plan:
         begin = time.perf_counter()
         solution = self.projection.solve(stack.law_levels(grasp))
@@ -125,7 +148,12 @@ class PaperForm:
         laws(stack)
 
     def plan(
-        self, stack: Stack, grasp: Grasp, history: Sequence[Touch] = (), left: int | None = None
+        self,
+        stack: Stack,
+        grasp: Grasp,
+        history: Sequence[Touch] = (),
+        left: int | None = None,
+        careful: bool = False,
     ) -> Plan:
         begin = time.perf_counter()
         solution = self.projection.solve(paper_levels(stack, grasp))
@@ -133,7 +161,7 @@ class PaperForm:
 
 
 @dataclass(frozen=True)
-class MemoryForm:
+class HierarchyForm:
     """The strict hierarchy, after what all touches together say of the surface.
 
     Force and moment go after the best of the places where the contacts would balance (`Aim`), and
@@ -141,12 +169,17 @@ class MemoryForm:
     the share of the other laws' step for which they leave room. An aim that limits keep the hand
     from is passed over for the next, and so is one aim for every two misses among the last touches.
 
+    While fingers push along the surface rather than into it, by their mean angle to the normal, and
+    where it is to be careful, the step is the PaperHierarchyForm's: slower and surer. The first is
+    for the first touches only, and keeps the hand out of postures that balance but hold badly.
+
     Without a ForceTask and a MomentTask, and for other than two or three contacts, it is the
-    HierarchyForm.
+    MemorylessForm.
     """
 
     hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
     shares: ClassVar[tuple[float, ...]] = (1.0, 0.5) * 4  # of a step, while nothing is touched
+    careful_for: ClassVar[int] = 10  # touches, after the hand began again from its first grasp
 
     def check(self, stack: Stack) -> None:
         """Every stack has this form."""
@@ -157,6 +190,7 @@ class MemoryForm:
         grasp: Grasp,
         history: Sequence[Touch] = (),
         left: int | None = None,
+        careful: bool = False,
     ) -> Plan:
         force = [task for task in stack.tasks if isinstance(task, ForceTask)]
         moment = [task for task in stack.tasks if isinstance(task, MomentTask)]
@@ -167,6 +201,9 @@ class MemoryForm:
         back = way_back(stack, history, left)
         if back is not None:
             return self._back(stack, grasp, back, begin)
+        careful = careful or (len(history) <= self.careful_for and _fingers_lean(stack, grasp))
+        if careful and not why_not(stack):
+            return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
         if _misses_since_a_grasp(history) // 2 % 2 == 1:  # another way than the memory's
             return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
         memory = SurfaceMemory.of(history, force[0].radius)
@@ -190,19 +227,17 @@ class MemoryForm:
         projection = Projection(rank_tolerance=self.hqp.rank_tolerance)
         for _ in range(SHORTENINGS):
             aimed, rest = aim.levels(stack, share)
-            x = projection.solve(aimed).x
-            ratio = cap_ratio(x, stack, grasp)
+            rest = [Level.equal(v.A, share / gain * v.upper, v.name) for v in rest]
+            unlimited = projection.solve(aimed + rest).x
+            ratio = cap_ratio(unlimited, stack, grasp)
             if ratio <= 1.0 + CAP_TOLERANCE:
                 break
             share /= ratio
-        unlimited = projection.solve(aimed + rest).x
-        room = cap_room(x, unlimited - x, stack, grasp)
-        rest = [Level.equal(v.A, v.A @ x + room * (v.upper - v.A @ x), v.name) for v in rest]
         solution = self.hqp.solve(stack.limit_levels(grasp) + aimed + rest)
         way = aimed[-1]
         asked = max(float(np.linalg.norm(way.upper)), NEAR)
         missing = float(np.linalg.norm(way.A @ solution.x - way.upper)) / asked
-        return _Step(solution, unlimited, share < gain or room < 1.0, missing)
+        return _Step(solution, unlimited, share < gain, missing)
 
     def _back(self, stack: Stack, grasp: Grasp, q: np.ndarray, begin: float) -> Plan:
         """Straight back to q, joint by joint, as far as the caps allow.
@@ -231,13 +266,19 @@ class _Step:
     missing: float  # [–] share of the way asked for that limits keep from the step
 
 
+def _fingers_lean(stack: Stack, grasp: Grasp) -> bool:
+    """Whether the kinematic law's mean angle says that fingers push along the surface."""
+    laws = [v for v in stack.tasks if isinstance(v, KinematicTask) and v.kind == "angle"]
+    return any(float(law.error(grasp).mean()) > LEANING for law in laws)
+
+
 def _misses_since_a_grasp(history: Sequence[Touch]) -> int:
     """How many touches have missed since the last that did not."""
     felt = [i for i, touch in enumerate(history) if isinstance(touch.felt, Grasp)]
     return len(history) - 1 - felt[-1]
 
 
-FORMS = ("hierarchy", "memory", "paper-hierarchy", "clipped", "paper")
+FORMS = ("hierarchy", "memoryless", "paper-hierarchy", "clipped", "paper")
 
 
 def form_of(name: str, solver: str = "proxqp") -> Form:
@@ -246,8 +287,8 @@ def form_of(name: str, solver: str = "proxqp") -> Form:
     hqp = HQP(solver, rank_tolerance=TOUCH_RANK)
     if name == "hierarchy":
         return HierarchyForm(hqp)
-    if name == "memory":
-        return MemoryForm(hqp)
+    if name == "memoryless":
+        return MemorylessForm(hqp)
     if name == "paper-hierarchy":
         return PaperHierarchyForm(hqp)
     return ClippedForm() if name == "clipped" else PaperForm()

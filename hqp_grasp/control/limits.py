@@ -140,16 +140,5 @@ def cap_ratio(x: np.ndarray, stack: Stack, grasp: Grasp) -> float:
     return ratio
 
 
-def cap_room(x: np.ndarray, more: np.ndarray, stack: Stack, grasp: Grasp) -> float:
-    """The share of `more`, 0 … 1, that the caps of a stack leave room for beside x."""
-    share = 1.0
-    for level in _caps(stack, grasp):
-        value, step = level.A @ x, level.A @ more
-        grows = step != 0.0
-        room = np.where(step > 0.0, level.upper - value, value - level.lower)
-        share = min(share, float((room[grows] / np.abs(step[grows])).min(initial=1.0)))
-    return max(share, 0.0)
-
-
 def _caps(stack: Stack, grasp: Grasp) -> list[Level]:
     return [limit.level(grasp) for limit in stack.limits if limit.priority is Priority.CAP]

@@ -49,21 +49,31 @@ def paper_levels(stack: Stack, grasp: Grasp) -> list[Level]:
 
 
 def laws(stack: Stack) -> list[ContactSpaceTask | KinematicTask]:
-    """The laws in the paper's order: contact-space laws, one a priority, then the kinematic."""
-    tasks: list[ContactSpaceTask | KinematicTask] = []
+    """The laws in the paper's order: contact-space laws, one a priority, then the kinematic.
+
+    Raises InputError for a stack that the paper's form cannot compose.
+    """
+    if reason := why_not(stack):
+        raise InputError(reason)
+    return [task for task in stack.tasks if isinstance(task, ContactSpaceTask | KinematicTask)]
+
+
+def why_not(stack: Stack) -> str:
+    """Why the paper's form cannot compose these laws; empty where it can."""
+    below = False
     for beside in stack.priorities:
         if len(beside) > 1:
-            raise InputError("the paper's form has one law a priority: compose with >>, not +")
+            return "the paper's form has one law a priority: compose with >>, not +"
         task = beside[0]
         if not isinstance(task, ContactSpaceTask | KinematicTask):
-            raise InputError(
-                f"the paper's form composes contact-space laws and KinematicTask; "
+            return (
+                "the paper's form composes contact-space laws and KinematicTask; "
                 f"{task.name} is neither"
             )
-        if tasks and isinstance(tasks[-1], KinematicTask):
-            raise InputError("the paper's form has its kinematic law last; use another form")
-        tasks.append(task)
-    return tasks
+        if below:
+            return "the paper's form has its kinematic law last; use another form"
+        below = isinstance(task, KinematicTask)
+    return ""
 
 
 def _nullspace(J: np.ndarray) -> np.ndarray:

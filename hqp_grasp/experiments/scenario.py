@@ -68,10 +68,10 @@ class Settings:
     """Results folder; a rerun continues it. Default: out/SCENARIO-STACK-FORM."""
     strict: bool = False
     """Stop at the first trial that ends in an error; else it is recorded and the others go on."""
-    form: Literal["hierarchy", "memory", "paper-hierarchy", "clipped", "paper"] = "hierarchy"
-    """hierarchy: strict priorities within limits. memory: the same, with laws that know all points
-    felt, for flat faces and edges. paper-hierarchy: the paper's levels, strictly, within limits.
-    clipped: projection, then clipped to the limits. paper: gradients in contact space and
+    form: Literal["hierarchy", "memoryless", "paper-hierarchy", "clipped", "paper"] = "hierarchy"
+    """hierarchy: strict priorities within limits, led by all that was felt. memoryless: the same by
+    the last grasp alone. paper-hierarchy: the paper's levels, strictly, within limits. clipped:
+    projection of memoryless, then clipped to the limits. paper: gradients in contact space and
     SR-inverse (eq. 11-13), then clipped."""
     kinematic_error: Literal["angle", "eq7"] = "angle"
     """The kinematic law's error: the angle the paper plots, or its eq. 7 to the letter."""

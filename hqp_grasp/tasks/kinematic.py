@@ -10,6 +10,7 @@ from hqp_grasp.errors import InputError, SingularTaskError, one_of
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.tasks.stack import Task
 
+SETTLES = {"gradient": 0.6, "rows": 0.25}  # gain of each form, unless another is given
 ALIGNED = 1e-9  # [rad] nearer to its minimum than this, an error has no direction of descent
 STILL = 1e-9  # [m/rad] flexion joints that move their contact slower than this do not move it
 EQUAL_SPEEDS = 1e-6  # [–] relative difference of two singular values below which they are equal
@@ -31,11 +32,12 @@ class KinematicTask(Task):
     `potential` is their sum ε_c and `gradient` its slope (paper, eq. 8–9). As in eq. 9 the contact
     is a point of the hand, and its normal is held fixed.
 
-    - form="rows": one Newton row per contact, J_i x = −gain·ε_i, with gain [–]. Full steps aim at
-      a zero that most hands cannot reach, and chatter about the minimum; a quarter settles.
-    - form="gradient": the paper's dq_c ∝ −∂ε_c/∂q as a level of n rows, x = −gain·∂ε_c/∂q. It
-      fixes every joint, so nothing below it is felt. Here gain has the unit rad²/(unit of ε):
-      rad for "angle", rad³/m for "eq7".
+    - form="gradient", the default: the paper's dq_c ∝ −∂ε_c/∂q as a level of n rows,
+      x = −gain·∂ε_c/∂q. It fixes every joint, so nothing below it is felt. Here gain has the unit
+      rad²/(unit of ε): rad for "angle", rad³/m for "eq7".
+    - form="rows": one Newton row per contact, J_i x = −gain·ε_i, with gain [–], which leaves the
+      other joints to laws below. Full steps aim at a zero that most hands cannot reach, and chatter
+      about the minimum; a quarter settles.
     """
 
     kind: str  # "angle" or "eq7"
@@ -46,9 +48,9 @@ class KinematicTask(Task):
     def __init__(
         self,
         error: str | None = None,
-        form: str = "rows",
+        form: str = "gradient",
         *,
-        gain: float = 0.25,
+        gain: float | None = None,
         weight: float = 1.0,
         kind: str = "angle",
     ) -> None:
@@ -56,7 +58,7 @@ class KinematicTask(Task):
         chosen = kind if error is None else error
         set_field(self, "kind", one_of("KinematicTask error", chosen, ["angle", "eq7"]))
         set_field(self, "form", one_of("KinematicTask form", form, ["rows", "gradient"]))
-        set_field(self, "gain", gain)
+        set_field(self, "gain", SETTLES[form] if gain is None else gain)
         set_field(self, "weight", weight)
         self.__post_init__()
 

@@ -11,7 +11,7 @@ from hqp_grasp.control.forms import FORMS, form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Contact, Miss, Missed, Touch
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.history import load_history, save_history
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, stack_of
 from hqp_grasp.touch.geometric import GeometricProbe
@@ -107,7 +107,7 @@ def test_targets_are_within_the_ranges_and_steps_within_the_caps(scene, robot, s
 
 
 def test_misses_shorten_the_step_then_the_controller_gives_up(robot, stack, first):
-    controller = Controller(robot, stack, landing=False)
+    controller = Controller(robot, stack, "memoryless", landing=False)
     history = [Touch(first.q, first)]
     steps = []
     for share in SHARES:
@@ -126,7 +126,8 @@ def test_misses_shorten_the_step_then_the_controller_gives_up(robot, stack, firs
 
 @pytest.mark.parametrize("reason", Miss)
 def test_every_miss_has_a_reaction_and_an_end(robot, stack, first, reason):
-    controller, history, told = Controller(robot, stack, landing=False), [Touch(first.q, first)], []
+    controller = Controller(robot, stack, "memoryless", landing=False)
+    history, told = [Touch(first.q, first)], []
     plain = controller.step(history)
     assert plain.reason == ""
     while len(told) < 10:
@@ -228,7 +229,7 @@ def test_a_malformed_history_is_refused(robot, stack, history, message):
     [
         (
             {"form": "papr"},
-            "unknown form 'papr'; choose one of: hierarchy, memory, paper-hierarchy, ",
+            "unknown form 'papr'; choose one of: hierarchy, memoryless, paper-hierarchy, ",
         ),
         ({"budget": 0}, "at least 1 touch"),
         ({"robot": "wam_bhand"}, "must be a Robot"),
@@ -280,3 +281,43 @@ def test_the_history_of_something_else_is_named(tmp_path):
     path.write_text('{"a": 1}')
     with pytest.raises(ResultsError, match="no history of touches"):
         load_history(path)
+
+
+def test_a_hand_that_is_lost_begins_again_from_its_first_grasp(scene, robot, stack, first):
+    controller = Controller(robot, stack)
+    history = walk(controller, GeometricProbe(scene), [Touch(first.q, first)], 3)
+    last = next(touch.felt for touch in reversed(history) if isinstance(touch.felt, Grasp))
+    again = controller.step(history)
+    while "first grasp again" not in again.reason:
+        history.append(Touch(again.q_target, MISSED))
+        again = controller.step(history)
+        assert len(history) < 20
+    careful = form_of("paper-hierarchy").plan(controller.stack, first)
+    np.testing.assert_array_equal(again.plan.x, careful.x)
+    np.testing.assert_array_equal(again.via[-1], first.q)
+    assert np.abs(again.q_target - first.q).max() < np.abs(again.q_target - last.q).max()
+
+
+def test_a_hand_that_is_lost_from_its_first_grasp_again_gives_up(robot, stack, first):
+    controller, history = Controller(robot, stack), [Touch(first.q, first)]
+    told = []
+    while (step := controller.step(history)).q_target is not None:
+        told.append(step.reason)
+        history.append(Touch(step.q_target, MISSED))
+        assert len(history) < 40
+    assert sum("first grasp again" in reason for reason in told) == 1
+    assert "misses from one grasp" in step.reason
+
+
+def test_a_palm_that_withdrew_in_vain_takes_the_way_again(robot, stack, first):
+    """A retreat that ends in a miss does not stay: the next step is shorter instead."""
+    controller = Controller(robot, stack, "memoryless", landing=False)
+    plain = controller.step([Touch(first.q, first)])
+    misses = [Missed(Miss.OTHER_LINK, "palm"), MISSED]
+    history = [Touch(first.q, first), *(Touch(plain.q_target, miss) for miss in misses)]
+    assert controller.step(history[:2]).reason == "palm back by 10 mm"
+    step = controller.step(history)
+    assert step.reason == "0.5 of the step"
+    np.testing.assert_allclose(
+        step.q_target - first.q, 0.5 * (plain.q_target - first.q), atol=1e-14
+    )

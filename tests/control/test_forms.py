@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hqp_grasp.control.forms import HierarchyForm, cap_ratio, clip_to_limits, form_of
+from hqp_grasp.control.forms import MemorylessForm, cap_ratio, clip_to_limits, form_of
 from hqp_grasp.control.limits import StepLimit
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.hierarchy.hqp import HQP
@@ -60,7 +60,7 @@ class Beside(HQP):
 
 def test_the_gap_is_the_largest_difference_from_the_projection():
     grasp = hand(0, np.random.default_rng(0).standard_normal((3, 3)))
-    plan = HierarchyForm(Beside(rank_tolerance=1e-6)).plan(stack_of("fmk").within(WIDE), grasp)
+    plan = MemorylessForm(Beside(rank_tolerance=1e-6)).plan(stack_of("fmk").within(WIDE), grasp)
     assert not plan.limit_active
     assert plan.gap == pytest.approx(0.01, rel=1e-6)
 

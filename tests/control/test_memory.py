@@ -218,7 +218,7 @@ def test_the_axis_is_that_of_the_sides_though_ends_were_felt_often():
 
 def probed(scene, first, probes, stack=None):
     """A trial of the form from a grasp."""
-    trial = Trial(scene, stack or stack_of("fmk"), form="memory", probes=probes, start=first)
+    trial = Trial(scene, stack or stack_of("fmk"), form="hierarchy", probes=probes, start=first)
     return trial.run((616, 0))
 
 
@@ -234,16 +234,16 @@ def hexagon():
 
 @pytest.fixture(scope="module")
 def first(cylinder):
-    return Trial(cylinder, stack_of("fmk"), form="memory", probes=1).run((616, 0)).grasps[0]
+    return Trial(cylinder, stack_of("fmk"), form="hierarchy", probes=1).run((616, 0)).grasps[0]
 
 
 @pytest.fixture(scope="module")
 def first_on_hexagon(hexagon):
-    return Trial(hexagon, stack_of("fmk"), form="memory", probes=1).run((777, 1)).grasps[0]
+    return Trial(hexagon, stack_of("fmk"), form="hierarchy", probes=1).run((777, 1)).grasps[0]
 
 
 def test_steps_are_certified_within_limits_and_the_same_each_time(cylinder, first):
-    controller = Controller(cylinder.articulated, stack_of("fmk"), "memory")
+    controller = Controller(cylinder.articulated, stack_of("fmk"), "hierarchy")
     history = [Touch(first.q, first)]
     step, again = controller.step(history), controller.step(history)
     assert step.q_target.tobytes() == again.q_target.tobytes()
@@ -282,7 +282,7 @@ def test_the_whole_way_leads_to_balance(cylinder, first):
 
 def test_a_stored_history_is_continued_bit_for_bit(hexagon, first_on_hexagon, tmp_path):
     robot, probe = hexagon.articulated, GeometricProbe(hexagon)
-    controller = Controller(robot, stack_of("fmk"), "memory", budget=9)
+    controller = Controller(robot, stack_of("fmk"), "hierarchy", budget=9)
 
     def walked(history):
         while (step := controller.step(history)).q_target is not None:
@@ -312,7 +312,7 @@ def test_three_contacts_on_one_face_find_their_way_around(hexagon, first_on_hexa
     history = [Touch(grasp.q, grasp)]
     still = plain.step(history).plan.x
     moving = (
-        Controller(hexagon.articulated, stack_of("fm"), "memory", landing=False)
+        Controller(hexagon.articulated, stack_of("fm"), "hierarchy", landing=False)
         .step(history)
         .plan.x
     )
@@ -323,7 +323,7 @@ def test_three_contacts_on_one_face_find_their_way_around(hexagon, first_on_hexa
 def test_a_finger_on_an_edge_is_settled_there():
     """A pentagon's faces do not balance: it takes edges, and they are found and kept."""
     scene = Scene(object=Prism.regular(5, 0.06))
-    record = Trial(scene, stack_of("fmk"), form="memory", probes=25).run((777, 0))
+    record = Trial(scene, stack_of("fmk"), form="hierarchy", probes=25).run((777, 0))
     assert record.converged_at is not None and record.converged_at <= 20
     n = record.grasps[-1].normals
     corners = np.array(scene.object.polygon)
@@ -336,7 +336,7 @@ def test_a_finger_on_an_edge_is_settled_there():
 def test_an_object_that_moves_by_two_millimetres_is_grasped_again(cylinder, first):
     robot = cylinder.articulated
     moved = Scene(position=(0.722, 0.0, 0.2))
-    controller = Controller(robot, stack_of("fmk"), "memory")
+    controller = Controller(robot, stack_of("fmk"), "hierarchy")
     history = [Touch(first.q, first)]
     for scene, touches in ((cylinder, 10), (moved, 15)):
         probe = GeometricProbe(scene)
@@ -364,7 +364,7 @@ def test_a_balanced_grasp_is_kept_once_a_step_from_it_missed(cylinder, first):
 
 
 def test_the_best_grasp_is_returned_to_as_the_budget_runs_out(cylinder, first):
-    stack = Controller(cylinder.articulated, stack_of("fmk"), "memory").stack
+    stack = Controller(cylinder.articulated, stack_of("fmk"), "hierarchy").stack
     record = probed(cylinder, first, 3)
     better, worse = record.grasps[1], record.grasps[0]
     history = [Touch(better.q, better), Touch(worse.q, worse)]
@@ -376,21 +376,21 @@ def test_stacks_without_force_and_moment_are_the_plain_hierarchy(cylinder, first
     history = [Touch(first.q, first)]
     steps = [
         Controller(cylinder.articulated, stack_of("k"), form).step(history).q_target
-        for form in ("memory", "hierarchy")
+        for form in ("hierarchy", "memoryless")
     ]
     assert steps[0].tobytes() == steps[1].tobytes()
 
 
 def test_other_cylinders_need_no_radius_of_their_own():
     scene = Scene(object=Cylinder(radius=0.065))
-    record = Trial(scene, stack_of("fmk"), form="memory", probes=12).run((777, 0))
+    record = Trial(scene, stack_of("fmk"), form="hierarchy", probes=12).run((777, 0))
     assert record.converged_at is not None and record.converged_at <= 8
 
 
 def test_on_an_irregular_prism_only_the_memory_finds_balance():
-    trial = Trial(irregular.scene, stack_of("fmk"), probes=30, form="memory")
+    trial = Trial(irregular.scene, stack_of("fmk"), probes=30, form="hierarchy")
     seeds = [(90210, i) for i in range(5)]
     with_memory = [trial.run(seed).verdict for seed in seeds]
-    without = [dataclasses.replace(trial, form="hierarchy").run(seed).verdict for seed in seeds]
+    without = [dataclasses.replace(trial, form="memoryless").run(seed).verdict for seed in seeds]
     assert with_memory.count("good") >= 4
     assert without.count("good") <= 1

@@ -44,7 +44,7 @@ def stack():
 
 @pytest.fixture(scope="module")
 def trial(scene, stack):
-    return Trial(scene, stack, probes=PROBES)
+    return Trial(scene, stack, probes=PROBES, form="memoryless")
 
 
 @pytest.fixture(scope="module")
