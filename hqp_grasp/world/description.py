@@ -347,14 +347,28 @@ class RobotDescription:
             slides = name[-2:] in ("_x", "_y", "_z")
             joint = roots[0].add_joint(name=name, axis=R_root.T @ axis, pos=R_root.T @ to_palm)
             joint.type = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
-            joint.range, joint.limited = ends, mujoco.mjtLimited.mjLIMITED_TRUE
+            unit = 1.0 if slides else _angle_unit(spec)
+            joint.range, joint.limited = np.array(ends) / unit, mujoco.mjtLimited.mjLIMITED_TRUE
+
+    def _units(self) -> dict[str, float]:
+        """Of each joint whose file gives angles in degrees, what one of them is [rad]."""
+        return {
+            part.prefix + joint.name: _angle_unit(spec)
+            for part in self.files
+            for spec in [part.spec()]
+            for joint in spec.joints
+            if joint.type != mujoco.mjtJoint.mjJNT_SLIDE and spec.compiler.degree
+        }
 
     def _change(self, spec: mujoco.MjSpec) -> None:
         """Do to the model what the description asks for."""
         joints = {joint.name: joint for joint in spec.joints}
+        units = self._units() if self.ranges or self.couplings or self.lock else {}
+        refs = {name: joint.ref * units.get(name, 1.0) for name, joint in joints.items()}
         for name, ends in self.ranges.items():
             joint = joints[self._joint(name, joints, "ranges")]
-            joint.range, joint.limited = ends, mujoco.mjtLimited.mjLIMITED_TRUE
+            joint.range = np.array(ends) / units.get(name, 1.0)
+            joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
         for name in self.drop_couplings if isinstance(self.drop_couplings, tuple) else ():
             known = [n for e in spec.equalities for n in (e.name, e.name1) if n]
             if name not in known:
@@ -369,7 +383,7 @@ class RobotDescription:
         for coupling in self.couplings:
             one = joints[self._joint(coupling.joint, joints, "couplings")]
             other = joints[self._joint(coupling.to, joints, "couplings")]
-            rest = coupling.offset + coupling.ratio * other.ref - one.ref
+            rest = coupling.offset + coupling.ratio * refs[other.name] - refs[one.name]
             _couple(spec, one.name, other.name, rest, coupling.ratio)
         home = self.home_angles(spec)
         for name in (*self.lock, *home):
@@ -378,8 +392,7 @@ class RobotDescription:
             if joints[name].type == mujoco.mjtJoint.mjJNT_FREE:
                 spec.delete(joints[name])
                 continue
-            ref = joints[name].ref
-            _couple(spec, name, "", home.get(name, ref) - ref, 0.0)
+            _couple(spec, name, "", home.get(name, refs[name]) - refs[name], 0.0)
         for body in spec.bodies:
             for i, geom in enumerate(body.geoms):
                 if not geom.name and (geom.contype or geom.conaffinity):
@@ -422,6 +435,11 @@ class RobotDescription:
 
     def _joint(self, name: str, joints: Mapping[str, object], where: str) -> str:
         return _known("joint", name, joints, f"{where} of {self.name}")
+
+
+def _angle_unit(spec: mujoco.MjSpec) -> float:
+    """What 1 in the angles of a model file is [rad]."""
+    return float(np.pi / 180.0) if spec.compiler.degree else 1.0
 
 
 def ball_name(point: ContactPoint) -> str:

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from hqp_grasp.world.description import ModelFile
 
+BODY = pin.FrameType.BODY  # a joint may be named like its body
 POSTURES = 3  # random ones that are compared
 
 
@@ -40,7 +41,7 @@ def second_opinion(part: ModelFile) -> Agreement:
     if missing or other.nv != model.nv:
         return Agreement(name, reason=f"Pinocchio finds {other.nv} joints, MuJoCo {model.nv}")
     at = [other.joints[other.getJointId(joint)] for joint in joints]
-    bodies = [b for b in range(1, model.nbody) if other.existFrame(model.body(b).name)]
+    bodies = [b for b in range(1, model.nbody) if other.existFrame(model.body(b).name, BODY)]
     data, scratch = mujoco.MjData(model), other.createData()
     rng = np.random.default_rng(0)
     low, high = np.where(model.jnt_limited, model.jnt_range.T, [[-1.0], [1.0]])
@@ -59,13 +60,13 @@ def second_opinion(part: ModelFile) -> Agreement:
         pin.updateFramePlacements(other, scratch)
         # Pinocchio drops the pose of a root that stands still: both are seen from there.
         root = int(model.body_rootid[model.jnt_bodyid[0]])
-        known = other.existFrame(model.body(root).name) and not model.body_jntnum[root]
+        known = other.existFrame(model.body(root).name, BODY) and not model.body_jntnum[root]
         ours = _pose(data.xpos[root], data.xmat[root]) if known else pin.SE3.Identity()
         theirs = pin.SE3.Identity()
         if known:
-            theirs = scratch.oMf[other.getFrameId(model.body(root).name)]
+            theirs = scratch.oMf[other.getFrameId(model.body(root).name, BODY)]
         for body in bodies:
-            frame = other.getFrameId(model.body(body).name)
+            frame = other.getFrameId(model.body(body).name, BODY)
             J = np.zeros((3, model.nv))
             mujoco.mj_jacBody(model, data, J, None, body)
             axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

@@ -15,6 +15,7 @@ from hqp_grasp.world.description import RobotDescription, locate
 from hqp_grasp.world.objects import Cylinder
 from hqp_grasp.world.robot import Robot, compiled
 from hqp_grasp.world.scene import Scene
+from hqp_grasp.world.second_opinion import second_opinion
 
 EXACT = 1e-12
 SHORT = 'model = "tiny.xml"\n[[contact_points]]\nlink = "distal"\n'
@@ -128,6 +129,25 @@ def test_home_lock_ranges_couplings_and_speed_are_changed_as_said(tmp_path):
     np.testing.assert_array_equal(robot.velocity, [3.0])
 
 
+def test_ranges_couplings_and_locks_are_radians_whatever_the_files_angles_are_in(tmp_path):
+    xml = XML[: XML.index("  <keyframe>")] + "</mujoco>"
+    xml = change(xml, 'angle="radian"', 'angle="degree"')
+    xml = change(xml, 'axis="0 0 1" range="0 3"', 'axis="0 0 1" range="0 180" ref="30"')
+    xml = change(xml, 'range="-0.1 0.8"', 'range="-6 45"')
+    toml = """
+        model = "tiny.xml"
+        ranges = { proximal = [0.0, 1.5], lift = [-0.2, 0.2] }
+        drop_couplings = true
+        couplings = [{ joint = "distal", to = "proximal", ratio = 0.5, offset = 0.1 }]
+        contact_points = [{ link = "distal" }]
+    """
+    robot = written(tmp_path, xml, toml)
+    np.testing.assert_allclose([robot.q_lower, robot.q_upper], [[-0.2, 0], [0.2, 1.3708]], atol=1e-4)
+    np.testing.assert_allclose(robot.offset, [0, 0, 0.1], atol=EXACT)
+    locked = written(tmp_path, xml, 'drop_couplings = true\nlock = ["proximal"]\n' + SHORT)
+    np.testing.assert_allclose(locked.offset, [0, np.pi / 6, 0], atol=1e-9)
+
+
 def test_all_couplings_can_be_dropped_at_once(tmp_path):
     robot = written(tmp_path, toml="drop_couplings = true\n" + SHORT)
     assert robot.joints == ("lift", "proximal", "distal")
@@ -161,6 +181,25 @@ def test_a_carriage_holds_the_palm_as_a_start_does(tmp_path):
     np.testing.assert_allclose(
         np.abs(J @ J.T), np.eye(6), atol=1e-9
     )  # all six ways, about the palm
+
+
+def test_a_carriage_turns_as_far_whatever_the_files_angles_are_in(tmp_path):
+    palm = 'palm = { body = "palm", approach = [1, 0, 0], opposition = [0, 1, 0] }'
+    xml = XML[: XML.index("  <keyframe>")] + "</mujoco>"
+    lift = '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>'
+    xml = change(change(xml, lift, ""), 'angle="radian"', 'angle="degree"')
+    xml = change(xml, 'axis="0 0 1" range="0 3"', 'axis="0 0 1" range="0 170"')
+    robot = written(tmp_path, xml, f"carriage = true\ndrop_couplings = true\n{palm}\n{SHORT}")
+    np.testing.assert_allclose(robot.q_upper[:6], [2, 2, 2, 2.6, 1.4, 2.6])
+
+
+def test_pinocchio_is_asked_for_bodies_where_joints_are_named_alike(tmp_path):
+    xml = change(XML, 'name="proximal" axis', 'name="distal_joint" axis')
+    xml = xml.replace('joint2="proximal"', 'joint2="distal_joint"')
+    xml = xml.replace("distal_joint", "palm")
+    tiny_hand.write(tmp_path, xml, SHORT)
+    (part,) = RobotDescription.load(tmp_path).files
+    assert second_opinion(part).position < 1e-9
 
 
 def test_a_file_of_an_installed_package_is_found_without_importing_it(tmp_path):
