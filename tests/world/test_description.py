@@ -142,7 +142,9 @@ def test_ranges_couplings_and_locks_are_radians_whatever_the_files_angles_are_in
         contact_points = [{ link = "distal" }]
     """
     robot = written(tmp_path, xml, toml)
-    np.testing.assert_allclose([robot.q_lower, robot.q_upper], [[-0.2, 0], [0.2, 1.3708]], atol=1e-4)
+    np.testing.assert_allclose([robot.q_lower[0], robot.q_upper[0]], [-0.2, 0.2], atol=1e-9)
+    # half of it and 0.1 more must stay below the distal joint's 45°
+    np.testing.assert_allclose(robot.q_upper[1], 2 * (np.pi / 4 - 0.1), atol=1e-9)
     np.testing.assert_allclose(robot.offset, [0, 0, 0.1], atol=EXACT)
     locked = written(tmp_path, xml, 'drop_couplings = true\nlock = ["proximal"]\n' + SHORT)
     np.testing.assert_allclose(locked.offset, [0, np.pi / 6, 0], atol=1e-9)
