@@ -40,6 +40,7 @@ from hqp_grasp.tasks import (
 from hqp_grasp.touch.driver import Driver, DriverLimits, Readings
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.touch.imperfections import Imperfections
+from hqp_grasp.touch.noisy import Noise
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.touch.sensing import sense
@@ -78,6 +79,7 @@ __all__ = [
     "Missed",
     "ModelError",
     "MomentTask",
+    "Noise",
     "PaperForm",
     "PhysicalProbe",
     "Physics",

@@ -257,17 +257,22 @@ def true_columns(
     if hand is None:
         return row
     truth = hand.truth()
-    grasp = truth.grasp
     if floor is not None:
         row["floor_f"], row["floor_m"] = floor
-    return row | {
-        "eps_f_true": None if grasp is None else ForceTask().potential(grasp),
-        "eps_m_true": None if grasp is None else MomentTask().potential(grasp),
+    return (row | true_errors(truth.grasp)) | {
         "object_moved": truth.moved,
         "other_links": ", ".join(truth.other_links),
         "peak_force": hand.worst["force [N]"],
         "peak_speed": hand.worst["speed share"],
         "peak_torque": hand.worst["torque share"],
+    }
+
+
+def true_errors(grasp: Grasp | None) -> dict[str, object]:
+    """Columns eps_f_true and eps_m_true of a grasp as it is; None where a tip does not touch."""
+    return {
+        "eps_f_true": None if grasp is None else ForceTask().potential(grasp),
+        "eps_m_true": None if grasp is None else MomentTask().potential(grasp),
     }
 
 

@@ -35,6 +35,7 @@ from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.experiments.view import PORT, serve
 from hqp_grasp.tasks import Stack, stack_of
+from hqp_grasp.touch.noisy import Noise
 from hqp_grasp.world.scene import Scene
 
 # What the table on screen and the figure are made of.
@@ -87,6 +88,9 @@ class Settings:
     """geometric: exact distances. physical: a simulated hand, driven and felt as a real one."""
     preset: Literal["loadcell"] | None = None
     """Imperfections of the physical probe's hand; without, there are none."""
+    noise: tuple[float, float] | None = None
+    """Feel each contact with errors of this size: its normal [rad] and its position [m]. For the
+    geometric probe."""
     links: Literal["block", "pass"] = "block"
     """Whether links other than the fingertips are stopped by the object, or pass through it, as in
     the paper."""
@@ -149,6 +153,7 @@ def trial_of(scene: Scene, settings: Settings) -> Trial:
         links=settings.links,
         probe=settings.probe,
         preset=settings.preset,
+        noise=None if settings.noise is None else Noise(*settings.noise),
     )
 
 

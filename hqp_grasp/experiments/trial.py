@@ -17,6 +17,7 @@ from hqp_grasp.experiments.record import (
     felt_row,
     kind_and_message,
     true_columns,
+    true_errors,
 )
 from hqp_grasp.experiments.start import FirstTouch, Start
 from hqp_grasp.grasp import Grasp, Missed, Touch
@@ -24,6 +25,7 @@ from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Stack, Task
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.touch.imperfections import Imperfections
+from hqp_grasp.touch.noisy import Noise, NoisyProbe
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.touch.simulated import Physics, SimulatedHand
@@ -51,6 +53,7 @@ class Trial:
     links: str = "block"  # or "pass": see GeometricProbe
     probe: str | Physics = "geometric"  # or "physical", which is Physics()
     preset: str | None = None  # of Imperfections, replacing those of `probe`
+    noise: Noise | None = None  # on contacts that the geometric probe feels
     start: Start | Grasp = field(default_factory=Start)
 
     def __post_init__(self) -> None:
@@ -62,6 +65,10 @@ class Trial:
             if self.physics is None:
                 raise InputError(f"preset {self.preset!r} needs probe='physical'")
             object.__setattr__(self, "probe", replace(self.physics, imperfections=imperfections))
+        if self.noise is not None and self.physics is not None:
+            raise InputError(
+                "noise is for probe='geometric'; a simulated hand's sensors have a preset"
+            )
         if self.probes < 1:
             raise InputError(f"a trial needs at least 1 probe; got {self.probes}")
         if not isinstance(self.start, Start | Grasp):
@@ -176,10 +183,10 @@ class Trial:
         stack = Stack.of(self.stack)
         hand, touching = self._hand(began, entropy, probe)
         felt: Grasp | Missed = began.grasp
-        if hand is not None:
+        if isinstance(touching, PhysicalProbe | NoisyProbe):
             felt = touching.touch(began.grasp.q)
         history = [Touch(began.grasp.q, felt)]
-        yield self._row(robot, stack, history[0], None, hand), history[0]
+        yield self._row(robot, stack, history[0], None, hand, touching), history[0]
         while len(history) <= self.probes:
             step = controller.step(history)
             if step.q_target is None:
@@ -188,7 +195,7 @@ class Trial:
                 return
             history.append(Touch(step.q_target, touching.touch(step.q_target)))
             yield (
-                self._row(robot, stack, history[-1], step.solution, hand) | _about(step),
+                self._row(robot, stack, history[-1], step.solution, hand, touching) | _about(step),
                 history[-1],
             )
 
@@ -196,19 +203,22 @@ class Trial:
         self, began: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
     ) -> tuple[SimulatedHand | None, Probe]:
         """The simulated hand, if any, and the probe that touches."""
-        physics = self.physics
-        if probe is not None or physics is None:
-            return None, probe or GeometricProbe(began.scene, self.links)
+        physics, robot = self.physics, began.scene.articulated
         rng = np.random.default_rng(np.random.SeedSequence([*entropy, IMPERFECTIONS]))
+        if probe is not None or physics is None:
+            probe = probe or GeometricProbe(began.scene, self.links)
+            return None, probe if self.noise is None else NoisyProbe(probe, robot, self.noise, rng)
         hand = SimulatedHand(began.scene, physics, self.links, rng)
         hand.place(began.grasp.q)
-        return hand, PhysicalProbe(hand, began.scene.articulated, PRESS, hand.table)
+        return hand, PhysicalProbe(hand, robot, PRESS, hand.table)
 
     def _empty(
         self, robot: Robot, stack: Stack, solution: Solution | None = None
     ) -> dict[str, object]:
         row = empty_row(robot, stack, solution)
-        return row if self.physics is None else row | true_columns()
+        if self.physics is not None:
+            return row | true_columns()
+        return row if self.noise is None else row | true_errors(None)
 
     def _row(
         self,
@@ -217,6 +227,7 @@ class Trial:
         touch: Touch,
         solution: Solution | None,
         hand: SimulatedHand | None,
+        probe: Probe,
     ) -> dict[str, object]:
         felt, worst = touch.felt, robot.violation(touch.q_target)
         row = self._empty(robot, stack, solution)
@@ -228,6 +239,9 @@ class Trial:
         if hand is not None:
             worst = max(worst, hand.worst["range [rad]"])
             row |= true_columns(hand, self._floor(hand, felt))
+        if isinstance(probe, NoisyProbe):
+            true = probe.felt[-1]
+            row |= true_errors(true if isinstance(true, Grasp) else None)
         row["limit_violation"] = worst
         return row
 
