@@ -20,7 +20,8 @@ class Arguments:
     """An object from a file, and how to run it."""
 
     object: Path
-    """MJCF with one object of convex geoms, or a closed mesh (.obj, .stl); z is up."""
+    """MJCF with one object of convex geoms, or a closed mesh (.obj, .stl); z is up. A path, or
+    package:path in an installed package."""
     settings: Annotated[Settings, tyro.conf.arg(name="")]
     scale: float = 1.0
     """The file's unit [m]; 0.001 for millimetres."""

@@ -33,6 +33,7 @@ COLUMNS = {
     "in_contact": "bool: every finger touches",
     "outcome": "touch, or why the probe missed",
     "other_links": "links beside the fingertips that touch the object",
+    "in_transit": "links beside the fingertips that meet the object on the way, fingers open",
     "step_share": "share of the planned step that was taken",
     "reaction": "what the controller did about the misses since the last grasp",
     "limit_active": "bool: a limit holds the step that led here",
@@ -72,7 +73,7 @@ CONTACT_COLUMNS = {
 JOINT_COLUMN = "rad: joint angle"
 # "good", and what keeps a trial from being so, the gravest first.
 VERDICTS = ("good", "error", "lost", "not balanced", "link inside", "violation")
-TEXTS = {"outcome", "other_links", "method", "error", "reaction"}
+TEXTS = {"outcome", "other_links", "in_transit", "method", "error", "reaction"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -41,8 +41,8 @@ from hqp_grasp.world.scene import Scene
 # What the table on screen and the figure are made of.
 COLUMNS = (
     *("trial", "probe", "rejected", "error", "eps_f", "eps_m", "eps_k", "adduction_deg"),
-    *("elevation_deg", "in_contact", "other_links", "step_share", "limit_active"),
-    *("limit_violation", "hqp_projection_gap", "method"),
+    *("elevation_deg", "in_contact", "other_links", "in_transit", "step_share"),
+    *("limit_active", "limit_violation", "hqp_projection_gap", "method"),
 )
 # Settings that no trial reads.
 ABOUT_THE_RUN = {"trials", "seed", "jobs", "cluster", "out", "strict", "replay", "view", "port"}
@@ -233,7 +233,7 @@ def replay_command(scene: Scene, settings: Settings, trial: int) -> str:
 
 def summary(table: pa.Table) -> str:
     """What came of the trials, for people."""
-    texts = ("other_links", "method", "error")
+    texts = ("other_links", "in_transit", "method", "error")
     columns = {n: table[n].to_numpy() for n in COLUMNS if n not in texts}
     trials = len(np.unique(columns["trial"]))
     shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
@@ -297,6 +297,10 @@ def summary(table: pa.Table) -> str:
     lines.append(
         f"links    another link is in the object in {other.mean():.1%} of the probes, "
         f"at the end of {other[:, -1].sum()} trials"
+    )
+    met = says_something(table, "in_transit").reshape(trials, -1) & taken
+    lines.append(
+        f"         one meets it on the way in {met.sum() / max(1, taken.sum()):.1%} of moves"
     )
     lines.append(f"rejected {shaped['rejected'][:, 0].sum()} draws that could not start")
     return "\n".join(lines)

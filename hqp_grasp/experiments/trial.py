@@ -194,10 +194,8 @@ class Trial:
                 yield self._empty(robot, stack) | told, None
                 return
             history.append(Touch(step.q_target, touching.touch(step.q_target)))
-            yield (
-                self._row(robot, stack, history[-1], step.solution, hand, touching) | _about(step),
-                history[-1],
-            )
+            row = self._row(robot, stack, history[-1], step.solution, hand, touching)
+            yield row | _about(step) | _in_transit(touching, history, step), history[-1]
 
     def _hand(
         self, began: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
@@ -252,6 +250,16 @@ class Trial:
         away = np.linalg.norm(felt.positions - felt.positions.mean(axis=0), axis=1)
         reach, radius = float(np.sqrt((away**2).mean())), float(hand.robot.tip_radius.min())
         return self.physics.imperfections.floor(PRESS, radius, reach, felt.k)
+
+
+def _in_transit(probe: Probe, history: Sequence[Touch], step: Step) -> dict[str, object]:
+    """The column of what the move that a step asked for meets, where geometry can tell."""
+    probe = probe.probe if isinstance(probe, NoisyProbe) else probe
+    if not isinstance(probe, GeometricProbe) or step.q_target is None:
+        return {}
+    before = history[-2]
+    start = before.felt.q if isinstance(before.felt, Grasp) else before.q_target
+    return {"in_transit": ", ".join(probe.in_transit([start, *step.via, step.q_target]))}
 
 
 def _about(step: Step) -> dict[str, object]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -27,6 +28,7 @@ MAX_CLOSING_STEPS = 2000  # tens, but for tips that graze
 TILT = 0.3  # [rad] over which the place of a touch is averaged on a link that is no ball
 FAR = 2e-2  # [m] beyond this from the object a finger does not aim at it
 CLEAR = 2e-3  # [m] a link is lifted by to be tilted free of the object
+POSTURES = 10  # of a move, at each of which links may meet the object
 REACH = 0.5  # [m] gaps beyond this are not measured
 ANYWHERE = 100.0  # [m]
 ALL_THE_WAY = 100.0  # [rad] more than any range
@@ -111,14 +113,33 @@ class GeometricProbe:
             found = found if isinstance(pressed, Missed) else pressed
         q = found[0]
         robot.place(self._data, q)
-        others = tuple(
+        others = self._others()
+        if others and self.links == "block":
+            return Missed(Miss.OTHER_LINK, others[0])
+        return self._grasp(q, others)
+
+    def in_transit(self, way: Sequence[np.ndarray]) -> tuple[str, ...]:
+        """Links beside the contact points that meet the object along postures (n,) [rad], by name.
+
+        Fingers are opened by RETREAT, as `touch` opens them before the hand moves. Between two
+        postures of the `way` joints move together, and POSTURES are looked at.
+        """
+        robot = self.scene.articulated
+        opening = RETREAT * robot.closing.sum(axis=0)
+        met: dict[str, None] = {}
+        for start, end in pairwise(way):
+            for q in np.linspace(start, end, POSTURES):
+                robot.place(self._data, np.clip(q - opening, robot.q_lower, robot.q_upper))
+                met |= dict.fromkeys(self._others())
+        return tuple(met)
+
+    def _others(self) -> tuple[str, ...]:
+        """Links beside the contact points that are in the object, as the hand stands."""
+        return tuple(
             self.scene.model.geom(int(link)).name
             for link in self._links
             if self._distance(int(link), 0.0) < -OVERLAP
         )
-        if others and self.links == "block":
-            return Missed(Miss.OTHER_LINK, others[0])
-        return self._grasp(q, others)
 
     def _close(
         self, q_target: np.ndarray, ways: np.ndarray

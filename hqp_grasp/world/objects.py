@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from hqp_grasp.errors import InputError, positive
+from hqp_grasp.world.description import locate
 
 OBJECT = "object"  # name of the object's body and of its first geom in a scene
 OBJECT_COLOUR = (0.85, 0.55, 0.25, 1.0)
@@ -221,6 +222,7 @@ class Body:
     says so where the mesh fills less than CONVEX of it. Geoms that collide with nothing are
     drawn, not felt. The middle of the box around what is felt stands at the scene's position.
 
+    `file` is a path, or package:path in an installed package, which is not imported.
     `scale` is the file's unit [m], 0.001 for a file in millimetres. `content` is a hash of the
     shapes, so that a file which has changed is another object; give it to ask for that very one.
     """
@@ -233,7 +235,7 @@ class Body:
 
     def __post_init__(self) -> None:
         positive("Body.scale", self.scale)
-        path = Path(self.file).expanduser().absolute()
+        path = locate(str(Path(self.file).expanduser()), Path.cwd()).absolute()
         pieces = _load(path)
         felt = [piece for piece in pieces if piece.felt]
         if not felt:

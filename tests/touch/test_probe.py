@@ -383,6 +383,18 @@ def test_other_links_can_block_instead(crowded):
     assert missed.where in grasp.other_links
 
 
+def test_links_that_a_move_leads_through_the_object_are_named(tmp_path):
+    """A knuckle on the palm is lifted from below a short cylinder to above it, or not so far."""
+    geom = '<geom name="knuckle" type="sphere" size=".005" pos=".06 0 0" mass="0"/>'
+    xml = change(STIFF, '<site name="palm"/>', f'<site name="palm"/>{geom}')
+    scene = Scene(tiny_hand.write(tmp_path, xml), Cylinder(0.02, 0.1), (0.06, 0.0, 0.25))
+    probe = GeometricProbe(scene)
+    below, beside, above = (np.array([lift, 1.5]) for lift in (0.0, 0.1, 0.5))
+    assert probe.in_transit([below, above]) == ("knuckle",)
+    assert probe.in_transit([below, beside]) == probe.in_transit([below]) == ()
+    assert probe.in_transit([below, beside, above, below]) == ("knuckle",)
+
+
 @pytest.mark.parametrize(("depth", "touches"), [(1e-5, True), (1e-6, True), (-1e-6, False)])
 def test_a_link_touches_as_soon_as_it_is_in_the_object_by_a_thousandth_of_a_millimetre(
     tmp_path, depth, touches
