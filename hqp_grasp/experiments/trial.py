@@ -193,7 +193,7 @@ class Trial:
                 told = {"outcome": f"gave up: {step.reason}", "reaction": "gave up"}
                 yield self._empty(robot, stack) | told, None
                 return
-            history.append(Touch(step.q_target, touching.touch(step.q_target)))
+            history.append(Touch(step.q_target, _touched(touching, step)))
             row = self._row(robot, stack, history[-1], step.solution, hand, touching)
             yield row | _about(step) | _in_transit(touching, history, step), history[-1]
 
@@ -260,6 +260,13 @@ def _in_transit(probe: Probe, history: Sequence[Touch], step: Step) -> dict[str,
     before = history[-2]
     start = before.felt.q if isinstance(before.felt, Grasp) else before.q_target
     return {"in_transit": ", ".join(probe.in_transit([start, *step.via, step.q_target]))}
+
+
+def _touched(probe: Probe, step: Step) -> Grasp | Missed:
+    """What the probe feels at the step's target; a hand that moves passes the step's way first."""
+    if isinstance(probe, PhysicalProbe):
+        return probe.touch(step.q_target, step.via)  # type: ignore[arg-type]
+    return probe.touch(step.q_target)  # type: ignore[arg-type]
 
 
 def _about(step: Step) -> dict[str, object]:

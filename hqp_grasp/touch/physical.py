@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import mujoco
@@ -73,21 +74,20 @@ class PhysicalProbe:
         object.__setattr__(self, "_data", mujoco.MjData(self.robot.model))
         object.__setattr__(self, "_own", _own_links(self.robot))
 
-    def touch(self, q_target: np.ndarray) -> Grasp | Missed:
+    def touch(self, q_target: np.ndarray, via: Sequence[np.ndarray] = ()) -> Grasp | Missed:
         """Move to q_target (n,) [rad], close every finger, and return the grasp felt there.
 
-        A touch that misses ends where it began, its fingers open: the next one approaches from
-        where the last grasp was felt.
+        The postures `via` (n,) [rad], such as a `Step` has, are passed first with open fingers. A
+        touch that misses ends where it began, or at the last of those that were passed, its
+        fingers open: the next one approaches from where the last grasp was felt.
         """
-        away = self.robot.require_q("q_target", q_target).copy()
-        flexion = np.array([j for (j,) in self.robot.flexion])
-        expected = away[flexion]
-        away[flexion] = np.maximum(self.driver.limits.lower[flexion], expected - RETREAT)
+        target = self.robot.require_q("q_target", q_target)
+        *passed, away = (self._away(self.robot.require_q("via", q)) for q in (*via, target))
         heard = self._listen()
         if isinstance(heard, Missed):
             return heard
-        opened = self._opened(heard, away)
-        felt = self._touch(opened, away, expected)
+        way = [self._opened(heard, (passed or [away])[0]), *passed, away]
+        felt = self._touch(way, target[[j for (j,) in self.robot.flexion]])
         if isinstance(felt, Missed):
             if felt.reason is Miss.STUCK:
                 self._watch(self.driver, PAUSE)
@@ -95,7 +95,7 @@ class PhysicalProbe:
             back = self._opened(here, away)
             # Nobody knows what a finger is at: it may be behind the object.
             self._go(back, 2.0 * float(np.abs(back - here.q[-1]).max()) / SWIFT)
-            self._go(opened, MOVING)
+            self._go(way[-2], MOVING)
         return felt
 
     def _listen(self) -> Readings | Missed:
@@ -111,6 +111,12 @@ class PhysicalProbe:
                 names = [point.name for point in self.robot.description.contact_points]
                 return Missed(Miss.SENSOR, names[int(silent.argmax())])
 
+    def _away(self, q: np.ndarray) -> np.ndarray:
+        """The posture q (n,) [rad], each finger opened by RETREAT."""
+        flexion, away = [j for (j,) in self.robot.flexion], q.copy()
+        away[flexion] = np.maximum(self.driver.limits.lower[flexion], q[flexion] - RETREAT)
+        return away
+
     def _opened(self, readings: Readings, away: np.ndarray) -> np.ndarray:
         """Where the hand is, each finger opened by RETREAT, and at least as far as in `away`."""
         limits, flexion = self.driver.limits, [j for (j,) in self.robot.flexion]
@@ -119,14 +125,13 @@ class PhysicalProbe:
         q[flexion] = np.maximum(limits.lower[flexion], opened)
         return q
 
-    def _touch(self, opened: np.ndarray, away: np.ndarray, expected: np.ndarray) -> Grasp | Missed:
-        for q, duration, reason in (
-            (opened, OPENING, Miss.STUCK),
-            (away, MOVING, Miss.BLOCKED),
-        ):
-            fault = self._go(q, duration)
+    def _touch(self, way: Sequence[np.ndarray], expected: np.ndarray) -> Grasp | Missed:
+        """Open to way[0], go along the others, and close."""
+        for i, q in enumerate(way):
+            fault = self._go(q, MOVING if i else OPENING)
             if fault:
                 heard = self._listen()
+                reason = Miss.BLOCKED if i else Miss.STUCK
                 return heard if isinstance(heard, Missed) else Missed(reason, fault)
         self.driver.wait(RESTING)
         free = self.driver.wait(WEIGHING)

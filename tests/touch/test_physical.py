@@ -120,6 +120,40 @@ def test_a_miss_ends_where_the_touch_began_with_open_fingers(scene):
     assert (after[8:] < POSTURE[8:] - 0.3).all()
 
 
+def test_postures_to_pass_are_passed_with_open_fingers(scene):
+    class Noting(hg.SimulatedHand):
+        moves = ()
+
+        def move(self, q, duration):
+            self.moves += (q.copy(),)
+            return super().move(q, duration)
+
+    hand = Noting(scene, links="pass")
+    hand.place(POSTURE)
+    higher = POSTURE.copy()
+    higher[1] -= 0.1
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(POSTURE, via=[higher, POSTURE])
+    assert isinstance(felt, hg.Grasp)
+    _, first, second, last = hand.moves
+    for passed, asked in zip((first, second, last), (higher, POSTURE, POSTURE), strict=True):
+        np.testing.assert_array_equal(passed[:8], asked[:8])
+        assert (passed[8:] < asked[8:] - 0.3).all()
+
+
+def test_a_trial_passes_what_the_controller_wants_passed(scene, monkeypatch):
+    _, first = touch(scene, links="pass")
+    passed = []
+
+    def touch_twice(probe, q_target, via=()):
+        passed.append([q.copy() for q in via])
+        return first if len(passed) < 3 else hg.Missed(hg.Miss.NO_TOUCH, "finger_1")
+
+    monkeypatch.setattr(hg.PhysicalProbe, "touch", touch_twice)
+    hg.Trial(scene, hg.stack_of("fmk"), 25, probe="physical", start=first).run(0)
+    (again,) = [via for via in passed if via]
+    np.testing.assert_array_equal(again, [first.q])
+
+
 def test_an_object_in_the_way_stops_the_hand_below_its_force_limit(scene):
     hand = hg.SimulatedHand(scene)
     hand.place(AWAY)
