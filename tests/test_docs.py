@@ -25,6 +25,7 @@ BLOCKS = {page.name: BLOCK.findall(page.read_text(encoding="utf-8")) for page in
 PYTHON_ON = [
     "CONTRIBUTING.md",
     "README.md",
+    "any-robot.md",
     "index.md",
     "looking.md",
     "many-trials.md",
@@ -38,6 +39,7 @@ PYTHON_ON = [
     "solver.md",
 ]
 COMMANDS_ON = [
+    "any-robot.md",
     "looking.md",
     "many-trials.md",
     "objects.md",

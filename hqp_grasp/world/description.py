@@ -88,6 +88,8 @@ class ModelFile:
                     spec.compiler.balanceinertia = self.balanceinertia
                 if self.fusestatic is not None:
                     spec.compiler.fusestatic = self.fusestatic
+        except ModelError:  # a ValueError too, and says more
+            raise
         except (ValueError, ET.ParseError) as error:
             kind = "URDF" if self.is_urdf else "MJCF"
             raise ModelError(f"{self.file} is not a valid {kind}: {error}") from error

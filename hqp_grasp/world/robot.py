@@ -517,6 +517,8 @@ def compiled(description: RobotDescription) -> mujoco.MjModel:
     """The described robot alone, as MuJoCo compiles it."""
     try:
         return description.spec().compile()
+    except ModelError:  # a ValueError too, and says more
+        raise
     except ValueError as error:
         raise InputError(f"{description.xml.name} does not compile: {error}") from error
 

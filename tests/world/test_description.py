@@ -1,5 +1,8 @@
 """What a description can say, and every robot that is refused, with the words that say why."""
 
+import re
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
@@ -365,6 +368,47 @@ def test_a_file_that_is_joined_needs_a_prefix_and_a_body_that_is_there(tmp_path)
     refused(lambda: written(tmp_path, toml=parts + points), 'prefix = "hand_"')
     at = 'prefix = "b_"\nat = "distl"\n'
     refused(lambda: written(tmp_path, toml=parts + at + points), "did you mean 'distal'?")
+
+
+BARE = change(XML, '<site name="palm"/>', '<site name="palm"/><body name="bare"/>')
+NEGATIVE = change(change(XML, "0 0.5 0 0 0", "0 -1 0 0 0"), 'range="-0.1 0.8"', 'range="0 3"')
+LIFT = '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>'
+FREE = change(XML, LIFT, '<freejoint name="root"/>')
+FREE = FREE[: FREE.index("  <keyframe>")] + "</mujoco>"
+JOINED = '[[model]]\nfile = "tiny.xml"\n[[model]]\nfile = "tiny.xml"\n[[contact_points]]\n'
+TWO = SHORT + 'flexion = ["proximal"]\n[[contact_points]]\nlink = "palm"\nball = { radius = 0.01 }\n'
+REFUSALS = (
+    lambda folder: written(folder, NEGATIVE),
+    lambda folder: written(folder, change(XML, "0 0.5 0 0 0", "-1 -1 0 0 0")),
+    lambda folder: written(folder, toml=TWO + 'flexion = ["lift"]\n'),
+    lambda folder: written(folder, toml=TWO),
+    lambda folder: written(folder, FREE),
+    lambda folder: robot_of(claw(folder, '<mesh filename="tip.dae"/>')),
+    lambda folder: robot_of(claw(folder, '<mesh filename="package://claw/tip.stl"/>')),
+    lambda folder: written(folder, change(XML, ' angle="radian"', "")),
+    lambda folder: written(folder, toml=SHORT.replace("contact_points", "contact_point")),
+    lambda folder: written(folder, toml='lock = ["lft"]\n' + SHORT),
+    lambda folder: written(folder, toml=SHORT.replace("distal", "dista")),
+    lambda folder: written(folder, BARE, SHORT.replace("distal", "bare")),
+    lambda folder: written(folder, toml="home = { proximal = 3.5 }\n" + SHORT),
+    lambda folder: written(folder, toml=JOINED + 'link = "distal"\n'),
+    lambda folder: written(folder, toml=SHORT.replace("tiny.xml", "no_such_package:hand.xml")),
+)
+
+
+def test_the_docs_quote_every_refusal_in_its_own_words(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "any-robot.md").read_text(encoding="utf-8")
+    table = page[page.index("## When it is refused") :]
+    quoted = re.findall(r"^\| `(.+?)` \|", table, re.MULTILINE)
+    (tmp_path / "tip.dae").write_text("")
+    told = []
+    for refusal in REFUSALS:
+        with pytest.raises(ModelError) as error:
+            refusal(tmp_path)
+        told.append(str(error.value))
+    assert len(quoted) == len(told)
+    for words, message in zip(quoted, told, strict=True):
+        assert re.search(".*".join(map(re.escape, words.split("…"))), message), (words, message)
 
 
 # ---------------------------------------------------------------- the check
