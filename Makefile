@@ -41,7 +41,7 @@ help:
 	@echo 'make bench   compare with peers, print ratios'
 	@echo 'make outside   let robots that nobody here wrote grasp; 1 GB of packages (an hour)'
 	@echo 'make mutants   spoil the code in 28 places, see whether tests notice (an hour)'
-	@echo 'make results   run all that README and docs quote, into out/results and docs/images (an hour)'
+	@echo 'make results   run all that README and docs quote, into out/results, docs/images and docs/data (hours)'
 	@echo 'make clean   remove what these made, except results in out/'
 	@echo 'Each installs what it needs into .venv first; PYTHON=python3.12 chooses the Python.'
 
@@ -81,7 +81,7 @@ mutants: $(READY_DEV)
 	$(PY) benchmarks/mutants.py
 
 # Every command whose figures README.md and docs/ quote. What each prints goes into $(RESULTS), pictures
-# into docs/images/. tests/test_packaging.py knows if docs quote a command that is not here.
+# into docs/images/, their data into docs/data/. tests/test_packaging.py knows if docs quote a command that is not here.
 RESULTS := out/results
 keep = $(PY) $(2) > $(RESULTS)/$(1).txt
 study = $(PY) scenarios/$(1).py --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
@@ -109,7 +109,12 @@ results: $(READY_BENCH) pictures
 	$(PY) -m hqp_grasp report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
 	cp $(RESULTS)/cylinder/convergence.png docs/images/cylinder-convergence.png
 	$(call keep,cylinder-physical,scenarios/cylinder.py --probe physical --preset loadcell --out $(RESULTS)/cylinder-physical)
+	$(call keep,figures,benchmarks/figures.py)
+	$(call keep,figures-paper,benchmarks/figures.py --form paper)
+	$(call keep,damping,benchmarks/damping.py --trials 100 --seed 53)
+	$(call keep,compositions,benchmarks/compositions.py --trials 100 --seed 31)
 	$(call keep,prisms,benchmarks/prisms.py --seed 0)
+	$(call keep,polygons,benchmarks/polygons.py --polygons 20 --starts 50 --seed 0)
 	$(call keep,probing,benchmarks/probing.py)
 	$(call keep,limits,benchmarks/limits.py)
 	$(call keep,limits-6,benchmarks/limits.py --trials 6)
