@@ -69,7 +69,9 @@ def main(configurations: int = 2000, seed: int = 0, solver: str = "proxqp") -> N
             shares[form].append(descent(A, -minus_f, x) / ideal)
     count = len(shares["hierarchy"])
     print(f"bhand, palm fixed, {count} of {configurations} configurations, seed {seed}, {solver}\n")
-    print(f"{'share of the ideal':20}{'mean':>8}{'median':>8}{'5 %':>8}{'least':>8}{'below 0.99':>12}")
+    print(
+        f"{'share of the ideal':20}{'mean':>8}{'median':>8}{'5 %':>8}{'least':>8}{'below 0.99':>12}"
+    )
     for form, values in shares.items():
         middle, low = np.percentile(values, [50, 5])
         below = f"{np.mean(np.array(values) < 0.99):.1%}"

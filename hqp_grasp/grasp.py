@@ -49,6 +49,7 @@ class Contact:
     tip_radius: float = 0.0  # [m] from `point` to the touching surface; 0 for a material point
     wrench: np.ndarray | None = None  # (6,) force [N], torque [N·m] on the tip, when sensed
     confidence: float = 1.0  # 0 … 1
+    noise: float = 0.0  # [rad] standard error of `normal` about each axis across it, when sensed
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -70,8 +71,11 @@ class Contact:
             ) from error
         set_field(self, "tip_radius", number("Contact.tip_radius", self.tip_radius))
         set_field(self, "confidence", number("Contact.confidence", self.confidence))
+        set_field(self, "noise", number("Contact.noise", self.noise))
         if not (np.isfinite(self.tip_radius) and self.tip_radius >= 0.0):
             raise InputError(f"Contact.tip_radius must be ≥ 0 [m]; got {self.tip_radius}")
+        if not (np.isfinite(self.noise) and self.noise >= 0.0):
+            raise InputError(f"Contact.noise must be ≥ 0 [rad]; got {self.noise}")
         if not 0.0 <= self.confidence <= 1.0:
             raise InputError(f"Contact.confidence must lie in [0, 1]; got {self.confidence}")
 
@@ -145,6 +149,17 @@ class Grasp:
     def normals(self) -> np.ndarray:
         """Outward unit normals (k, 3), world."""
         return np.array([c.normal for c in self.contacts])
+
+    @property
+    def floor(self) -> tuple[float, float]:
+        """ε_f [N²] and ε_m [(N·m)²] that noise makes of these contacts in balance, on average.
+
+        With the noise σ_i of the normals, about two axes each, ε_f = 2 Σ σ_i² and
+        ε_m = 2 Σ σ_i² |x_i − x̄|².
+        """
+        square = 2.0 * np.array([c.noise for c in self.contacts]) ** 2
+        away = self.positions - self.positions.mean(axis=0)
+        return float(square.sum()), float(square @ (away * away).sum(axis=1))
 
     @property
     def q_full(self) -> np.ndarray:

@@ -72,6 +72,12 @@ def test_a_tip_radius_is_finite_and_not_negative(radius):
         contact(tip_radius=radius)
 
 
+@pytest.mark.parametrize("noise", [-1e-9, np.nan, np.inf, None, "little"])
+def test_noise_is_finite_and_not_negative(noise):
+    with pytest.raises(InputError, match=r"Contact\.noise"):
+        contact(noise=noise)
+
+
 @pytest.mark.parametrize("confidence", [-0.1, 1.1, np.nan, np.inf, None, "sure"])
 def test_confidence_lies_between_none_and_all(confidence):
     with pytest.raises(InputError, match=r"Contact\.confidence"):
@@ -166,3 +172,22 @@ def test_nothing_in_a_grasp_can_be_changed():
 def test_a_misshapen_grasp_is_refused_by_name(field, bad, message):
     with pytest.raises(InputError, match=message):
         grasp(**{field: bad})
+
+
+def test_the_floor_is_what_noise_makes_of_a_balanced_grasp_on_average():
+    rng, noise = np.random.default_rng(0), np.array([0.01, 0.02, 0.03])
+    angles = 2.0 * np.pi * np.arange(3) / 3.0
+    normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    felt = normals + noise[:, None] * rng.normal(size=(20_000, 3, 3))
+    felt /= np.linalg.norm(felt, axis=2)[..., None]
+    force, moment = felt.sum(axis=1), np.cross(0.05 * normals, felt).sum(axis=1)
+    contacts = [
+        contact(position=0.05 * n, normal=n, noise=s) for n, s in zip(normals, noise, strict=True)
+    ]
+    floor = Grasp(q=[0.0], contacts=contacts, jacobian=np.zeros((9, 1))).floor
+    eps = (force**2).sum(axis=1).mean(), (moment**2).sum(axis=1).mean()
+    np.testing.assert_allclose(eps, floor, rtol=0.03)
+
+
+def test_without_noise_there_is_no_floor():
+    assert Grasp(q=[0.0], contacts=[contact()], jacobian=np.zeros((3, 1))).floor == (0.0, 0.0)

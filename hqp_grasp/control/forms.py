@@ -11,9 +11,9 @@ import numpy as np
 
 from hqp_grasp.control.aim import Aim
 from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, cap_ratio
-from hqp_grasp.control.memory import SurfaceMemory
+from hqp_grasp.control.memory import SurfaceMemory, steadied
 from hqp_grasp.control.paper import laws, paper_levels, why_not
-from hqp_grasp.control.settling import way_back
+from hqp_grasp.control.settling import ease, way_back
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
@@ -198,6 +198,9 @@ class HierarchyForm:
             return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
         begin = time.perf_counter()
         history = history or (Touch(grasp.q, grasp),)
+        last = [touch.felt for touch in history].index(grasp)
+        history = steadied(history)
+        grasp = history[last].felt  # type: ignore[assignment]
         back = way_back(stack, history, left)
         if back is not None:
             return self._back(stack, grasp, back, begin)
@@ -211,9 +214,10 @@ class HierarchyForm:
         gain = min(1.0, force[0].gain, moment[0].gain)
         aims = Aim.each(memory, grasp)
         aims = aims[min(misses // 2, len(aims) - 1) :][:TRIED]
+        lower = ease(stack, history)
         steps = []
         for aim in aims:
-            steps.append(self._towards(aim, gain, stack))
+            steps.append(self._towards(aim, gain, stack, lower))
             if steps[-1].missing < REACHED:
                 break
         step = min(steps, key=lambda step: step.missing)
@@ -222,12 +226,12 @@ class HierarchyForm:
         gap = None if limit_active else float(np.abs(step.solution.x - step.unlimited).max())
         return Plan(step.solution.x, step.solution, limit_active, gap, solve_us)
 
-    def _towards(self, aim: Aim, gain: float, stack: Stack) -> _Step:
+    def _towards(self, aim: Aim, gain: float, stack: Stack, lower: float) -> _Step:
         grasp, share = aim.grasp, gain
         projection = Projection(rank_tolerance=self.hqp.rank_tolerance)
         for _ in range(SHORTENINGS):
             aimed, rest = aim.levels(stack, share)
-            rest = [Level.equal(v.A, share / gain * v.upper, v.name) for v in rest]
+            rest = [Level.equal(v.A, lower * share / gain * v.upper, v.name) for v in rest]
             unlimited = projection.solve(aimed + rest).x
             ratio = cap_ratio(unlimited, stack, grasp)
             if ratio <= 1.0 + CAP_TOLERANCE:

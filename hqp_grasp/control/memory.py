@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from hqp_grasp.grasp import Grasp, Touch
 
 CONTRADICTION = 2e-4  # [m] a point may lie beyond the tangent plane of another
 SLACK = 2e-6  # [m] rounding of what was felt
+SURE = 2.5  # standard errors within which noise explains what was felt
+SAME_PLACE = 1.5e-3  # [m] from one tip's centre to another's, of which noise is averaged out
+LEAST_NOISE = 1e-6  # [rad]
 SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
 UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which tips decide
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
@@ -56,11 +59,17 @@ class SurfaceMemory:
         x = np.concatenate([grasp.positions for _, grasp in hits])
         n = np.concatenate([grasp.normals for _, grasp in hits])
         probes = np.concatenate([np.full(grasp.k, i) for i, grasp in hits])
-        beyond = n @ x.T - (n * x).sum(axis=1)[:, None]  # [j, k] of point k over the plane of j
-        apart = np.maximum(beyond, beyond.T) > CONTRADICTION
-        kept = ~(apart & (probes > probes[:, None])).any(axis=1)
-        x, n = x[kept], n[kept]
-        return cls(x, n, probes[kept], largest_balls(x, n, x, n, WIDEST * radius))
+        noise = SURE * np.array([c.noise for _, grasp in hits for c in grasp.contacts])
+        tip = np.array([c.tip_radius for _, grasp in hits for c in grasp.contacts])
+        # How far over the plane of point j noise may lift point k, [j, k] like all these.
+        doubt = noise[:, None] * (np.linalg.norm(x - x[:, None], axis=-1) + tip[:, None])
+        beyond = n @ x.T - (n * x).sum(axis=1)[:, None]
+        apart = beyond > CONTRADICTION + doubt
+        kept = ~((apart | apart.T) & (probes > probes[:, None])).any(axis=1)
+        x, n, noise, doubt = x[kept], n[kept], noise[kept], doubt[np.ix_(kept, kept)]
+        same = 0.5 * (noise[:, None] + noise) ** 2
+        balls = largest_balls(x, n, x, n, WIDEST * radius, SLACK + doubt, SAME_NORMAL + same)
+        return cls(x, n, probes[kept], balls)
 
     def axis(self, grasp: Grasp) -> np.ndarray:
         """The direction (3,) along which nothing curves, as far as was felt.
@@ -96,17 +105,55 @@ class SurfaceMemory:
         return Outline.around(c, np.concatenate([R, sharp]), frame, tip_radius, felt)
 
 
+def steadied(history: Sequence[Touch]) -> tuple[Touch, ...]:
+    """The same history, noise averaged out over all touches of one place, by any finger.
+
+    They are those with the tips' centres within SAME_PLACE whose normals differ by no more than
+    noise explains. Each counts by the inverse of its variance. What has no noise stays as it is.
+    """
+    contacts = [c for t in history if isinstance(t.felt, Grasp) for c in t.felt.contacts]
+    if not any(c.noise for c in contacts):
+        return tuple(history)
+    noise = np.maximum([c.noise for c in contacts], LEAST_NOISE)
+    n, rho = np.array([c.normal for c in contacts]), np.array([[c.tip_radius] for c in contacts])
+    centers = np.array([c.position for c in contacts]) + rho * n
+    near = np.linalg.norm(centers[:, None] - centers, axis=-1) < SAME_PLACE
+    alike = np.linalg.norm(n[:, None] - n, axis=-1) <= SURE * np.hypot(noise[:, None], noise)
+    weight = (near & alike) / noise**2
+    n = weight @ n
+    n /= np.linalg.norm(n, axis=1)[:, None]
+    noise = 1.0 / np.sqrt(weight.sum(axis=1))
+    averaged = (
+        replace(c, position=x, normal=normal, noise=float(sigma))
+        for c, x, normal, sigma in zip(contacts, centers - rho * n, n, noise, strict=True)
+    )
+    steady = []
+    for touch in history:
+        if isinstance(touch.felt, Grasp):
+            those = tuple(next(averaged) for _ in touch.felt.contacts)
+            touch = replace(touch, felt=replace(touch.felt, contacts=those))
+        steady.append(touch)
+    return tuple(steady)
+
+
 def largest_balls(
-    x: np.ndarray, n: np.ndarray, at: np.ndarray, normal: np.ndarray, widest: float
+    x: np.ndarray,
+    n: np.ndarray,
+    at: np.ndarray,
+    normal: np.ndarray,
+    widest: float,
+    slack: np.ndarray | float = SLACK,
+    same: np.ndarray | float = SAME_NORMAL,
 ) -> np.ndarray:
     """Radii (N,) [m] of balls that touch at x from inside, n being the outward normal there.
 
-    They are the largest that stay behind the planes through `at` (M, d) with outward `normal`.
+    They are the largest that stay behind the planes through `at` (M, d) with outward `normal`,
+    but for `slack` (M, N) [m]; planes whose normal differs by 1 − n·n' ≤ `same` tell nothing.
     """
     turn = 1.0 - normal @ n.T
     gap = (normal * at).sum(axis=1)[:, None] - normal @ x.T  # [k, j] of point j behind plane k
-    tells = turn > SAME_NORMAL
-    bound = np.where(tells, (np.maximum(gap, 0.0) + SLACK) / np.where(tells, turn, 1.0), widest)
+    tells = turn > same
+    bound = np.where(tells, (np.maximum(gap, 0.0) + slack) / np.where(tells, turn, 1.0), widest)
     return np.asarray(bound.min(axis=0, initial=widest))
 
 

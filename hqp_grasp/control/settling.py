@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from hqp_grasp.tasks import ForceTask, MomentTask, Stack
 
 FORCE_GOAL = 1e-3  # [N²] ε_f of a balanced grasp, at most
 MOMENT_GOAL = (2e-3) ** 2  # [(N·m)²] ε_m of one, at most
+BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
 BETTER = 2e-3  # by which the lower laws' errors fall, or the grasp is no better
+SURE = 2.0  # standard errors that tell two values apart
 PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
 
@@ -22,41 +25,72 @@ def way_back(stack: Stack, history: Sequence[Touch], left: int | None) -> np.nda
 
     Balanced grasps are kept: once the laws below force and moment improve no more, once a step from
     a balanced grasp lost it, and when the touches `left` only just suffice. A grasp that is not
-    there any more, because the object has moved, is forgotten.
+    there any more, because the object has moved, is forgotten. Under noise a grasp is balanced
+    within BEYOND times its floor, and BETTER shows in as many grasps as average the noise to it.
     """
-    hits = [t.felt for t in history if isinstance(t.felt, Grasp)]
-    score = iter(_scores(hits))
-    scores = np.array([next(score) if isinstance(t.felt, Grasp) else np.inf for t in history])
-    best, least, stale, lost = -1, np.inf, 0, False
-    for i, touch in enumerate(history):
-        if scores[i] <= 1.0:
-            if lost or stale >= PATIENCE:
-                continue
-            value = _below(stack, touch.felt)  # type: ignore[arg-type]
-            stale += 1
-            if best < 0 or value < least - BETTER:
-                best, least, stale = i, value, 0
-        elif best >= 0:
-            lost = True
-            if isinstance(touch.felt, Grasp) and _near(touch.q_target, history[best]):
-                best, stale, lost = -1, 0, False
-    if best >= 0 and (lost or stale >= PATIENCE):
+    course = _Course.of(stack, history)
+    best = course.best
+    if best >= 0 and course.over:
         return history[best].felt.q  # type: ignore[union-attr]
     if left is not None:
-        best = best if best >= 0 else int(scores.argmin())
+        best = best if best >= 0 else int(course.scores.argmin())
         q: np.ndarray = history[best].felt.q  # type: ignore[union-attr]
-        if left <= 1.0 + cap_ratio(q - hits[-1].q, stack, hits[-1]):
+        last = [t.felt for t in history if isinstance(t.felt, Grasp)][-1]
+        if left <= 1.0 + cap_ratio(q - last.q, stack, last):
             return q
     return None
 
 
+def ease(stack: Stack, history: Sequence[Touch]) -> float:
+    """Share of the lower laws' step to take: half of it for each balanced grasp it made worse."""
+    return 0.5 ** _Course.of(stack, history).worse
+
+
+@dataclass(frozen=True, eq=False)
+class _Course:
+    """How the touches of a history went."""
+
+    scores: np.ndarray  # of each touch, inf for misses
+    best: int  # touch with the best of the balanced grasps, −1: none
+    worse: int  # balanced grasps that were worse than the best before
+    over: bool  # whether it is time to go back
+
+    @classmethod
+    def of(cls, stack: Stack, history: Sequence[Touch]) -> _Course:
+        hits = [t.felt for t in history if isinstance(t.felt, Grasp)]
+        score = iter(_scores(hits))
+        scores = np.array([next(score) if isinstance(t.felt, Grasp) else np.inf for t in history])
+        noise = sum(contact.noise**2 for contact in hits[-1].contacts)  # [rad²] of the angles' sum
+        patience = PATIENCE + noise / BETTER**2
+        tells = max(BETTER, SURE * np.sqrt(2.0 * noise))
+        best, least, stale, lost, worse = -1, np.inf, 0, False, 0
+        for i, touch in enumerate(history):
+            if scores[i] <= 1.0:
+                if lost or stale >= patience:
+                    continue
+                value = _below(stack, touch.felt)  # type: ignore[arg-type]
+                stale += 1
+                worse += value > least + tells
+                if best < 0 or value < least - BETTER:
+                    best, least, stale = i, value, 0
+            elif best >= 0:
+                lost = True
+                if isinstance(touch.felt, Grasp) and _near(touch.q_target, history[best]):
+                    best, stale, lost = -1, 0, False
+        return cls(scores, best, worse, lost or stale >= patience)
+
+
 def _scores(hits: Sequence[Grasp]) -> np.ndarray:
-    """The larger of ε_f and ε_m in units of what a balanced grasp has at most."""
+    """The larger of ε_f and ε_m in units of what a balanced grasp is felt with, at most."""
+    floor = BEYOND * np.array([grasp.floor for grasp in hits])
     n = np.array([grasp.normals for grasp in hits])
     x = np.array([grasp.positions for grasp in hits])
     f = n.sum(axis=1)
     m = np.cross(n, x - x.mean(axis=1, keepdims=True)).sum(axis=1)
-    return np.maximum((f * f).sum(axis=1) / FORCE_GOAL, (m * m).sum(axis=1) / MOMENT_GOAL)
+    return np.maximum(
+        (f * f).sum(axis=1) / np.maximum(FORCE_GOAL, floor[:, 0]),
+        (m * m).sum(axis=1) / np.maximum(MOMENT_GOAL, floor[:, 1]),
+    )
 
 
 def _below(stack: Stack, grasp: Grasp) -> float:

@@ -10,17 +10,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL
 from hqp_grasp.errors import one_of
-from hqp_grasp.grasp import Grasp
+from hqp_grasp.grasp import Grasp, Missed
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.tasks.stack import Stack
 from hqp_grasp.touch.simulated import SimulatedHand
 from hqp_grasp.world.robot import Robot
 
-CONVERGED_FORCE = 1e-3  # [N²]
-CONVERGED_MOMENT = 2e-3  # √ε_m [N·m]
-BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
+CONVERGED_FORCE = FORCE_GOAL  # [N²]
+CONVERGED_MOMENT = float(np.sqrt(MOMENT_GOAL))  # √ε_m [N·m]
 
 # Name, unit and meaning of the columns that every probe fills.
 COLUMNS = {
@@ -251,15 +251,15 @@ def felt_row(
 
 
 def true_columns(
-    hand: SimulatedHand | None = None, floor: tuple[float, float] | None = None
+    hand: SimulatedHand | None = None, felt: Grasp | Missed | None = None
 ) -> dict[str, object]:
     """TRUE_COLUMNS, and the links in the object as they are; None where nothing is known."""
     row: dict[str, object] = dict.fromkeys(TRUE_COLUMNS)
     if hand is None:
         return row
     truth = hand.truth()
-    if floor is not None:
-        row["floor_f"], row["floor_m"] = floor
+    if isinstance(felt, Grasp):
+        row["floor_f"], row["floor_m"] = felt.floor
     return (row | true_errors(truth.grasp)) | {
         "object_moved": truth.moved,
         "other_links": ", ".join(truth.other_links),

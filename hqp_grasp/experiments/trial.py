@@ -236,20 +236,12 @@ class Trial:
             worst = max(worst, robot.violation(felt.q))
         if hand is not None:
             worst = max(worst, hand.worst["range [rad]"])
-            row |= true_columns(hand, self._floor(hand, felt))
+            row |= true_columns(hand, felt)
         if isinstance(probe, NoisyProbe):
             true = probe.felt[-1]
             row |= true_errors(true if isinstance(true, Grasp) else None)
         row["limit_violation"] = worst
         return row
-
-    def _floor(self, hand: SimulatedHand, felt: Grasp | Missed) -> tuple[float, float] | None:
-        """ε_f and ε_m that this grasp would be felt with, were it balanced."""
-        if isinstance(felt, Missed) or self.physics is None:
-            return None
-        away = np.linalg.norm(felt.positions - felt.positions.mean(axis=0), axis=1)
-        reach, radius = float(np.sqrt((away**2).mean())), float(hand.robot.tip_radius.min())
-        return self.physics.imperfections.floor(PRESS, radius, reach, felt.k)
 
 
 def _in_transit(probe: Probe, history: Sequence[Touch], step: Step) -> dict[str, object]:

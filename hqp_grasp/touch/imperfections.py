@@ -66,24 +66,6 @@ class Imperfections:
                 )
             object.__setattr__(self, at.name, value)
 
-    def floor(
-        self, force: float, tip_radius: float, reach: float, k: int = 3, samples: int = 20
-    ) -> tuple[float, float]:
-        """ε_f [N²] and ε_m [(N·m)²] that k contacts in perfect balance are felt with, on average.
-
-        A contact held with `force` F [N] on a tip of radius R [m] is sensed by σ_f/F [rad] in the
-        direction of its force, by σ_m/F [m] in its position and so by σ_m/(F R) in its normal,
-        along each of two axes. The tip is weighed in the air and felt under force, `samples` of
-        each. So ε_f = 2 k δ² with δ² = 2 (σ_f² + σ_m²/R²)/(F² samples), and ε_m = reach² ε_f for
-        contacts that lie `reach` [m] from their centroid.
-
-        A controller that has felt an error moves it to where the felt one was zero, so it ends with
-        true errors of this size, and feels twice as much.
-        """
-        noise = self.force_noise**2 + (self.torque_noise / tip_radius) ** 2
-        eps_f = 4.0 * k * noise / (force**2 * samples)
-        return eps_f, reach**2 * eps_f
-
     @classmethod
     def preset(cls, name: str | None, **changes: Any) -> Imperfections:
         """The imperfections of that name, None for none; `changes` replaces single values."""

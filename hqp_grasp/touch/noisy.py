@@ -49,4 +49,5 @@ class NoisyProbe:
     def _felt(self, contact: Contact) -> Contact:
         normal = contact.normal + self.noise.normal * self.rng.standard_normal(3)
         position = contact.position + self.noise.position * self.rng.standard_normal(3)
-        return replace(contact, normal=normal / np.linalg.norm(normal), position=position)
+        normal /= np.linalg.norm(normal)
+        return replace(contact, normal=normal, position=position, noise=self.noise.normal)

@@ -234,6 +234,7 @@ class PhysicalProbe:
                     return Missed(Miss.OWN_LINK, name)
         R_world_tip = robot.tip_frames(q).copy()
         wrench = self._steady(held) - self._steady(free)
+        unsure = self._unsure(held) + self._unsure(free)
         wrench -= weight(self._payload, R_world_tip)
         wrench += weight(self._payload, robot.tip_frames(free.q.mean(axis=0)))
         contacts = []
@@ -251,15 +252,30 @@ class PhysicalProbe:
             if self.table is not None and place[2] < self.table + NEAR and n[2] > UPWARDS:
                 return Missed(Miss.TABLE, names[i])
             world = np.concatenate([R @ wrench[i, :3], R @ wrench[i, 3:]])
-            contacts.append(Contact(place, n, wrench=world, confidence=upright))
+            noise = (
+                float(np.sqrt(unsure[i, :3].mean() + unsure[i, 3:].mean() / radius**2)) / pressed
+            )
+            contacts.append(Contact(place, n, wrench=world, confidence=upright, noise=noise))
         return robot.grasp(q, contacts)
 
     def _steady(self, readings: Readings) -> np.ndarray:
         """The wrenches (k, 6), averaged over all samples but spikes."""
-        force = readings.wrench[..., :3]
-        beside = np.linalg.norm(force - np.median(force, axis=0), axis=-1)  # (t, k)
-        kept = beside <= np.maximum(SPIKE * self.force, np.median(beside, axis=0))
+        kept = self._kept(readings)
         return (readings.wrench * kept[..., None]).sum(axis=0) / kept.sum(axis=0)[:, None]
+
+    def _unsure(self, readings: Readings) -> np.ndarray:
+        """Variance (k, 6) of these averages by noise, as samples differ from the ones before."""
+        kept = self._kept(readings)
+        pairs = kept[1:] & kept[:-1]
+        steps = np.diff(readings.wrench, axis=0) * pairs[..., None]
+        most = np.maximum(pairs.sum(axis=0) * kept.sum(axis=0), 1)
+        return np.asarray(0.5 * (steps**2).sum(axis=0) / most[:, None])
+
+    def _kept(self, readings: Readings) -> np.ndarray:
+        """Samples (t, k) that are no spikes."""
+        force = readings.wrench[..., :3]
+        beside = np.linalg.norm(force - np.median(force, axis=0), axis=-1)
+        return np.asarray(beside <= np.maximum(SPIKE * self.force, np.median(beside, axis=0)))
 
 
 def _silent(readings: Readings) -> np.ndarray:

@@ -412,9 +412,9 @@ class Robot:
         """A complete grasp from joint angles and what was felt there.
 
         `contacts` has one Contact for each contact point, in the description's order: position and
-        outward normal (world), perhaps wrench and confidence; on a link that is no ball, perhaps
-        the `tip_radius` it is rounded by there. Name, link, point and flexion are the robot's, and
-        so are the grasp's Jacobian, Hessian and coupling.
+        outward normal (world), perhaps wrench, confidence and noise; on a link that is no ball,
+        perhaps the `tip_radius` it is rounded by there. Name, link, point and flexion are the
+        robot's, and so are the grasp's Jacobian, Hessian and coupling.
         """
         q = self.require_q("Robot.grasp: q", q)
         points = self.description.contact_points

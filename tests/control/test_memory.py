@@ -9,9 +9,9 @@ from hqp_grasp.scenarios import irregular
 
 from hqp_grasp.control.aim import Aim
 from hqp_grasp.control.controller import Controller
-from hqp_grasp.control.memory import SLACK, UNDECIDED, SurfaceMemory
+from hqp_grasp.control.memory import SAME_PLACE, SLACK, UNDECIDED, SurfaceMemory, steadied
 from hqp_grasp.control.outline import Outline, directions, wrapped
-from hqp_grasp.control.settling import FORCE_GOAL, MOMENT_GOAL, way_back
+from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, PATIENCE, ease, way_back
 from hqp_grasp.errors import InputError
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
@@ -220,6 +220,103 @@ def probed(scene, first, probes, stack=None):
     """A trial of the form from a grasp."""
     trial = Trial(scene, stack or stack_of("fmk"), form="hierarchy", probes=probes, start=first)
     return trial.run((616, 0))
+
+
+# ---------------------------------------------------------------- noise
+
+
+def noisy(history, noise, rng):
+    """The same contacts as a round tip feels them: the point lies where the normal says."""
+    contacts = []
+    for c in history.felt.contacts:
+        n = c.normal + noise * rng.normal(size=3)
+        n /= np.linalg.norm(n)
+        x = c.position + c.tip_radius * (c.normal - n)
+        contacts.append(dataclasses.replace(c, position=x, normal=n, noise=noise))
+    return Touch(history.q_target, dataclasses.replace(history.felt, contacts=tuple(contacts)))
+
+
+def test_touches_of_one_place_are_averaged_by_the_inverse_of_their_variance():
+    rng, true = np.random.default_rng(1), on_circle(0.05, 0.0, 120.0, 240.0)
+    off, told = [], []
+    for _ in range(40):
+        steady = steadied([noisy(true, noise, rng) for noise in (0.01, 0.01, 0.02, 0.02)])
+        felt = steady[0].felt
+        for c in felt.contacts:
+            told.append(c.noise)
+            center = c.position + TIP * c.normal
+            assert np.linalg.norm(center) == pytest.approx(0.05 + TIP, abs=1e-12)
+        off.append(felt.normals - true.felt.normals)
+    across = np.sqrt((np.array(off) ** 2).sum(axis=-1).mean() / 2.0)
+    assert across == pytest.approx(0.01 / np.sqrt(2.5), rel=0.2)
+    assert np.median(told) == pytest.approx(0.01 / np.sqrt(2.5))  # some are too far off to count
+
+
+def test_places_and_faces_that_differ_are_not_averaged():
+    rng = np.random.default_rng(2)
+    apart = np.degrees(1.5 * SAME_PLACE / (0.05 + TIP))
+    one, other = (noisy(on_circle(0.05, a, 120.0 + a), 1e-3, rng) for a in (0.0, apart))
+    edge = noisy(on_square(0.04, 0.0, ("corner", 0, 0.0), ("corner", 0, 5.0)), 1e-3, rng)
+    for history in ([one, other], [edge]):
+        for before, after in zip(history, steadied(history), strict=True):
+            np.testing.assert_allclose(after.felt.normals, before.felt.normals, atol=1e-12)
+
+
+def test_what_has_no_noise_stays_as_it_is():
+    history = [on_circle(0.05, 0.0, 120.0, 240.0), on_circle(0.05, 0.1, 120.0, 240.0)]
+    assert all(a is b for a, b in zip(history, steadied(history), strict=True))
+
+
+def test_noise_neither_sharpens_a_circle_nor_has_it_forgotten():
+    rng, true = np.random.default_rng(3), on_circle(0.05, 0.0, 120.0, 240.0)
+    turned = on_circle(0.05, 4.0, 124.0, 244.0)
+    history = [noisy(touch, 0.01, rng) for touch in (true, turned, true, turned)]
+    memory = SurfaceMemory.of(history)
+    assert len(memory.radii) == 12
+    assert memory.radii.min() > 0.03
+
+
+def test_under_noise_balance_is_judged_by_its_floor_and_patience_grows(cylinder, first):
+    """What an exact sensor takes for worse, and for too late to go on, noise explains."""
+    stack = stack_of("fmk")
+    good = probed(cylinder, first, 6).grasps[-1]
+    noise = 0.02
+    felt = [dataclasses.replace(c, noise=noise) for c in good.contacts]
+    unsure = dataclasses.replace(good, contacts=tuple(felt))
+    history = [Touch(good.q, good)] * (PATIENCE + 1)
+    np.testing.assert_array_equal(way_back(stack, history, None), good.q)
+    assert way_back(stack, [Touch(good.q, unsure)] * (PATIENCE + 1), None) is None
+    # A push aside that is within the floor, but beyond the goals of an exact sensor.
+    n = felt[0].normal + np.array([0.0, 0.0, 1.5 * np.sqrt(FORCE_GOAL)])
+    for contact, lost in ((dataclasses.replace(felt[0], noise=0.0), True), (felt[0], False)):
+        aside = dataclasses.replace(contact, normal=n / np.linalg.norm(n))
+        others = [dataclasses.replace(c, noise=aside.noise) for c in felt[1:]]
+        grasp = dataclasses.replace(good, contacts=(aside, *others))
+        assert ForceTask().potential(grasp) > FORCE_GOAL
+        assert (ForceTask().potential(grasp) > BEYOND * grasp.floor[0]) == lost
+        history = [Touch(good.q, unsure), Touch(good.q + 0.1, grasp)]
+        assert (way_back(stack, history, None) is not None) == lost
+
+
+def test_a_step_that_overshot_is_followed_by_shorter_ones(cylinder, first):
+    """The kinematic law's step halves with each balanced grasp that it made worse."""
+    stack = stack_of("fmk")
+    good = probed(cylinder, first, 12).grasps[-1]
+    worse = dataclasses.replace(good, jacobian=_turned(good.jacobian, 0.1))
+    history = [Touch(good.q, good)]
+    assert ease(stack, history) == 1.0
+    assert ease(stack, [*history, Touch(good.q, worse)]) == 0.5
+    assert ease(stack, [*history, Touch(good.q, worse), Touch(good.q, worse)]) == 0.25
+
+
+def _turned(jacobian, angle):
+    """Flexions that move the contacts another way: about the vertical."""
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return (R @ jacobian.reshape(-1, 3, jacobian.shape[1])).reshape(jacobian.shape)
+
+
+# ---------------------------------------------------------------- the form
 
 
 @pytest.fixture(scope="module")

@@ -376,7 +376,9 @@ LIFT = '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>'
 FREE = change(XML, LIFT, '<freejoint name="root"/>')
 FREE = FREE[: FREE.index("  <keyframe>")] + "</mujoco>"
 JOINED = '[[model]]\nfile = "tiny.xml"\n[[model]]\nfile = "tiny.xml"\n[[contact_points]]\n'
-TWO = SHORT + 'flexion = ["proximal"]\n[[contact_points]]\nlink = "palm"\nball = { radius = 0.01 }\n'
+TWO = (
+    SHORT + 'flexion = ["proximal"]\n[[contact_points]]\nlink = "palm"\nball = { radius = 0.01 }\n'
+)
 REFUSALS = (
     lambda folder: written(folder, NEGATIVE),
     lambda folder: written(folder, change(XML, "0 0.5 0 0 0", "-1 -1 0 0 0")),
