@@ -185,7 +185,7 @@ def figure5(
         print(f"{name}: {len(ended)} of {trials} finish; {seconds:.1f} s CPU; {lost(outcomes)}")
         for column in ("adduction_deg", "elevation_deg"):
             last = np.array([o.record.column(column).astype(float)[-1] for o in ended])
-            print(f"  {column:14} {interval(last)}")
+            print(f"  {column:14} {interval(last)}, median {np.median(last):.2f}")
         felt = [[o.record.column(c).astype(float)[-1] for c in ("eps_f", "eps_m")] for o in ended]
         middle = np.nanmedian(felt, axis=0)
         print(f"  felt   ε_f {middle[0]:.1e} N², √ε_m {1e3 * np.sqrt(middle[1]):.2f} mm·N, medians")

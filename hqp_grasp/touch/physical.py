@@ -264,12 +264,14 @@ class PhysicalProbe:
         return (readings.wrench * kept[..., None]).sum(axis=0) / kept.sum(axis=0)[:, None]
 
     def _unsure(self, readings: Readings) -> np.ndarray:
-        """Variance (k, 6) of these averages by noise, as samples differ from the ones before."""
+        """Variance (k, 6) of these averages by noise: samples beside the middle of their two
+        neighbours, whose variance is 3/2 of one sample's, whatever drifts.
+        """
         kept = self._kept(readings)
-        pairs = kept[1:] & kept[:-1]
-        steps = np.diff(readings.wrench, axis=0) * pairs[..., None]
-        most = np.maximum(pairs.sum(axis=0) * kept.sum(axis=0), 1)
-        return np.asarray(0.5 * (steps**2).sum(axis=0) / most[:, None])
+        threes = kept[2:] & kept[1:-1] & kept[:-2]
+        beside = 0.5 * np.diff(readings.wrench, n=2, axis=0) * threes[..., None]
+        most = np.maximum(threes.sum(axis=0) * kept.sum(axis=0), 1)
+        return np.asarray((beside**2).sum(axis=0) / (1.5 * most[:, None]))
 
     def _kept(self, readings: Readings) -> np.ndarray:
         """Samples (t, k) that are no spikes."""

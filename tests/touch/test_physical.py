@@ -307,11 +307,12 @@ def test_the_preset_differs_from_perfect_in_every_value_with_a_unit():
 
 def test_a_contact_tells_the_noise_that_its_sensor_has(scene):
     noisy = hg.Imperfections(force_noise=0.02, torque_noise=2e-4)
+    # δ² = 2 (σ_f² + σ_m²/R²)/(F² samples): the tip is weighed, then felt, by 20 samples each; by
+    # half as many where a finger does not come to rest.
     for physics, due in ((hg.Physics(imperfections=noisy), 0.0101), (None, 0.0)):
         _, felt = touch(scene, physics, links="pass")
         told = np.sqrt(np.mean([contact.noise**2 for contact in felt.contacts]))
-        # δ² = 2 (σ_f² + σ_m²/R²)/(F² samples): the tip is weighed, then felt, by 20 samples each.
-        assert abs(told - due) < 0.15 * due + 1e-4
+        assert 0.85 * due <= told <= 1.4 * due + 1e-4
 
 
 def test_a_spike_is_no_noise(scene):
