@@ -18,10 +18,10 @@ import tyro
 
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
+from hqp_grasp.control.settling import BEYOND
 from hqp_grasp.errors import HqpGraspError, InputError, TrialError
 from hqp_grasp.experiments.plots import convergence
 from hqp_grasp.experiments.record import (
-    BEYOND,
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
     TRUE_COLUMNS,
