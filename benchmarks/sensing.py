@@ -80,6 +80,14 @@ def with_noise(noise: tuple[float, float], force: float, count: int, seed: int) 
     return np.array(errors)
 
 
+def force_for(wanted: float, errors: tuple[float, ...]) -> str:
+    """The force with an error of `wanted` [°], between those of FORCES."""
+    if errors[0] < wanted:
+        return f"less than {FORCES[0]:g} N"
+    log = np.interp(-np.log(wanted), -np.log(errors), np.log(FORCES))
+    return f"{np.exp(log):.2f} N"
+
+
 def main(
     starts: int = 120, seed: int = 0, count: int = 2000, plot: Path = Path("out/sensing.png")
 ) -> None:
@@ -117,13 +125,15 @@ def main(
         axis.loglog(FORCES, [middle for middle, _ in seen], f"C{n}-", label=f"{name}: median")
         axis.loglog(FORCES, [most for _, most in seen], f"C{n}--", label="95 %")
         print(name)
-        unit = with_noise(noise, 1.0, count, seed)
         for force, (middle, most) in zip(FORCES, seen, strict=True):
             print(f"  {force:4.1f} N   {middle:6.2f}° / {most:6.2f}°")
-        middle, most = np.percentile(unit, [50, 95]) / AIM
-        print(f"  {AIM:g}° needs {middle:.2f} N in the median, {most:.2f} N for 95 %")
+        middle, most = (force_for(AIM, errors) for errors in zip(*seen, strict=True))
+        print(f"  {AIM:g}° needs {middle} in the median, {most} for 95 %")
     axis.axhline(AIM, color="k", ls=":")
     axis.set(xlabel="force at the tip [N]", ylabel="error of the normal, one sample [°]")
+    axis.set_xticks(FORCES, [f"{force:g}" for force in FORCES])
+    axis.set_xticks([], minor=True)
+    axis.set_yticks([0.1, 1.0, 10.0], ["0.1", "1", "10"])
     axis.legend(fontsize=8)
     plot.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(plot, dpi=110)

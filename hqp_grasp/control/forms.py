@@ -166,8 +166,9 @@ class HierarchyForm:
 
     Force and moment go after the best of the places where the contacts would balance (`Aim`), and
     the other laws take what is left. The share of the way that the caps allow is taken; below it,
-    the share of the other laws' step for which they leave room. An aim that limits keep the hand
-    from is passed over for the next, and so is one aim for every two misses among the last touches.
+    the share of the other laws' step for which they leave room, half of it for each balanced grasp
+    that such a step made worse. An aim that limits keep the hand from is passed over for the next,
+    and so is one aim for every two misses among the last touches.
 
     While fingers push along the surface rather than into it, by their mean angle to the normal, and
     where it is to be careful, the step is the PaperHierarchyForm's: slower and surer. The first is
