@@ -7,7 +7,7 @@ uniform over their ranges, normals over those that a closing finger can press. T
 best step along a form's direction takes off ‖J_f x + f‖², of what the best of all steps x takes:
 
     hierarchy    force ▷ moment ▷ kinematic in joint space
-    eq. 11–13    composed in contact space, then mapped by the SR-inverse
+    eq. 11–13    the same laws composed in contact space, then mapped by the SR-inverse
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def main(configurations: int = 2000, seed: int = 0, solver: str = "proxqp") -> N
     hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK)
     damped = hg.Projection(damping=SR_DAMPING)
     rng = np.random.default_rng(seed)
-    shares: dict[str, list[float]] = {"hierarchy": [], "eq. 11–13": []}
+    alone = hg.Stack.of(hg.ForceTask())
+    shares: dict[str, list[float]] = {}
     for _ in range(configurations):
         grasp = drawn(robot, rng)
         A, minus_f = hg.ForceTask().rows(grasp)
@@ -64,18 +65,19 @@ def main(configurations: int = 2000, seed: int = 0, solver: str = "proxqp") -> N
         steps = {
             "hierarchy": hqp.solve(stack.law_levels(grasp)).x,
             "eq. 11–13": damped.solve(paper_levels(stack, grasp)).x,
+            "the same, force alone": damped.solve(paper_levels(alone, grasp)).x,
         }
         for form, x in steps.items():
-            shares[form].append(descent(A, -minus_f, x) / ideal)
+            shares.setdefault(form, []).append(descent(A, -minus_f, x) / ideal)
     count = len(shares["hierarchy"])
-    print(f"bhand, palm fixed, {count} of {configurations} configurations, seed {seed}, {solver}\n")
+    print(f"bhand, palm fixed, {count} of {configurations} configurations, seed {seed}\n")
     print(
-        f"{'share of the ideal':20}{'mean':>8}{'median':>8}{'5 %':>8}{'least':>8}{'below 0.99':>12}"
+        f"{'share of the ideal':24}{'mean':>8}{'median':>8}{'5 %':>8}{'least':>8}{'below 0.99':>12}"
     )
     for form, values in shares.items():
         middle, low = np.percentile(values, [50, 5])
         below = f"{np.mean(np.array(values) < 0.99):.1%}"
-        row = f"{form:20}{np.mean(values):8.2f}{middle:8.2f}{low:8.2f}{min(values):8.2f}"
+        row = f"{form:24}{np.mean(values):8.2f}{middle:8.2f}{low:8.2f}{min(values):8.2f}"
         print(f"{row}{below:>12}")
 
 

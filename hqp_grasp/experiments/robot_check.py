@@ -13,6 +13,7 @@ from hqp_grasp.world.description import CARRIAGE, RobotDescription
 from hqp_grasp.world.robot import CAPSULE, SPHERE, Robot, compiled, described
 from hqp_grasp.world.second_opinion import second_opinion
 
+CLOSINGS = np.linspace(0.0, 1.0, 21)  # shares by which fingers are closed
 AGREES = 1e-6  # [m] two readings of a file that differ by less are the same
 
 
@@ -99,7 +100,18 @@ def _contact_points(robot: Robot) -> list[str]:
             speed = float(J[i] @ robot.closing[i] @ towards / np.linalg.norm(towards))
             way = "towards" if speed > 0.0 else "AWAY FROM"
             lines.append(f"    at home it moves {way} the others at {1e3 * speed:+.0f} mm/rad")
+    if len(x) > 1:
+        radii = [_spread(robot.centers(robot.opened(robot.home, s))) for s in CLOSINGS]
+        lines.append(
+            f"  as they close, tips are {1e3 * radii[0]:.0f} … {1e3 * min(radii):.0f} mm from "
+            "their middle: an object must fit between"
+        )
     return lines
+
+
+def _spread(x: np.ndarray) -> float:
+    """Mean distance of points (k, 3) from their middle [m]."""
+    return float(np.linalg.norm(x - x.mean(axis=0), axis=1).mean())
 
 
 def _shape(model: mujoco.MjModel, geom: int) -> str:

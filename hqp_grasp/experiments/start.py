@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -26,6 +27,7 @@ CLOSINGS = 16  # sampled postures of closing fingers
 MAX_IK_STEPS = 60
 IK_STEP = 0.3  # [rad]
 IK_TOLERANCE = 1e-4  # [m, rad]
+MOST_COMMON = 3  # reasons why draws were rejected that are told
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ class Start:
         robot = scene.articulated
         if self == Start() and robot.description.start:
             return replace(self, **robot.description.start).draw(scene, probe_in, rng)
-        last = "none"
+        told: Counter[str] = Counter()
         for rejected in range(self.max_draws):
             adduction = rng.uniform(*self.adduction)
             elevation = rng.uniform(*self.elevation)
@@ -87,7 +89,7 @@ class Start:
             heading = float(np.arctan2(-offset[1], -offset[0]))
             hand = _open_hand(robot, adduction)
             if hand is None:
-                last = "the hand cannot spread as drawn"
+                told["the hand cannot spread as drawn"] += 1
                 continue
             reach = _reach(robot, hand[0]) + _extent(scene)
             distance = drawn - self.advance * np.ceil((drawn - reach) / self.advance)
@@ -95,10 +97,11 @@ class Start:
             found = self._first_touch(scene, probe_in, *hand, place)
             if not isinstance(found, str):
                 return FirstTouch(*found, rejected)
-            last = found
+            told[found] += 1
+        why = "; ".join(f"{count} {what}" for what, count in told.most_common(MOST_COMMON))
         raise ReachError(
             f"{robot.description.name} touches the object at {scene.position} from none of "
-            f"{self.max_draws} drawn postures (the last: {last}); move the object, or take another"
+            f"{self.max_draws} drawn postures ({why}); move the object, or take another"
         )
 
     def _first_touch(

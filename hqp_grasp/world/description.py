@@ -93,6 +93,9 @@ class ModelFile:
         except (ValueError, ET.ParseError) as error:
             kind = "URDF" if self.is_urdf else "MJCF"
             raise ModelError(f"{self.file} is not a valid {kind}: {error}") from error
+        # A frame without mass cannot be moved in MuJoCo; nothing here depends on so little.
+        spec.compiler.boundmass = max(spec.compiler.boundmass, 1e-9)
+        spec.compiler.boundinertia = max(spec.compiler.boundinertia, 1e-12)
         if self.degrees is not None:
             spec.compiler.degree = self.degrees
         elif not self.is_urdf and spec.compiler.degree:
