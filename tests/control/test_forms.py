@@ -76,3 +76,14 @@ def test_what_touch_cannot_tell_from_rounding_does_not_steer_a_step(name, seed):
         form_of(name).plan(stack, hand(seed, normals)).x for normals in (faces, faces + noise)
     )
     assert np.abs(felt - exact).max() < 1e-4 * (1.0 + np.abs(exact).max())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("above", ["", "f", "m"])
+def test_what_stands_below_the_kinematic_law_is_never_felt(above, seed):
+    grasp = hand(seed, np.random.default_rng(seed).standard_normal((3, 3)))
+    alone, more = (
+        stack_of(f"{above}k{v}").within(WIDE) for v in ("", "m" if above != "m" else "f")
+    )
+    form = MemorylessForm()
+    np.testing.assert_allclose(form.plan(more, grasp).x, form.plan(alone, grasp).x, atol=EXACT)

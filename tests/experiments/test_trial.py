@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hqp_grasp.control.controller import CLIP_TOLERANCE, SHARES
-from hqp_grasp.control.forms import TOUCH_RANK, clip_to_limits
+from hqp_grasp.control.forms import TOUCH_RANK, PaperForm, clip_to_limits
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import InputError, ReachError
 from hqp_grasp.experiments.record import COLUMNS
@@ -509,3 +509,12 @@ def test_a_stack_with_caps_of_its_own_still_keeps_the_robots_ranges(scene, stack
     record = Trial(scene, stack.within(StepLimit()), probes=PROBES).run(SEEDS[2])
     assert set(record.column("limit_violation")) == {0.0}
     assert record.converged_at is not None
+
+
+def test_what_the_papers_form_leaves_of_the_moment_is_in_proportion_to_its_damping():
+    left = []
+    for damping in (1e-5, 1e-6):
+        form = PaperForm(Projection(damping=damping))
+        record = Trial(Scene(), stack_of("fmk"), probes=25, form=form).run(SEEDS[0])
+        left.append(np.sqrt(record.rows[-1]["eps_m"]))
+    assert left[0] == pytest.approx(10.0 * left[1], rel=0.05)
