@@ -100,7 +100,8 @@ def paired_difference(one: Sequence[bool], other: Sequence[bool]) -> tuple[float
     worse = sum(a and not b for a, b in zip(one, other, strict=True)) + 0.5
     difference = (better - worse) / n
     half = Z * math.sqrt(better + worse - (better - worse) ** 2 / n) / n
-    return (sum(other) - sum(one)) / len(one), difference - half, difference + half
+    low, high = max(-1.0, difference - half), min(1.0, difference + half)
+    return (sum(other) - sum(one)) / len(one), low, high
 
 
 def report(folders: Sequence[str | Path]) -> str:
