@@ -31,6 +31,7 @@ HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE
 
 PARALLEL = 0.7  # [–] cosine of two joint axes that bend a finger alike
 SLIDE_UNIT = 0.06  # [m] a slide closes by while a hinge closes by 1 rad
+UNLIMITED = 1.0  # [rad] a joint without range opens and closes by from where it is
 CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
 
 
@@ -401,7 +402,8 @@ class Robot:
             way = np.abs(w[moving])
             behind = np.where(w > 0.0, q - self.q_lower, self.q_upper - q)[moving] / way
             ahead = np.where(w > 0.0, self.q_upper - q, q - self.q_lower)[moving] / way
-            if np.isfinite(behind).any():
+            behind, ahead = (np.where(np.isfinite(s), s, UNLIMITED) for s in (behind, ahead))
+            if moving.any():
                 s = (1.0 - share) * -behind.min() + share * (ahead.max() if share else 0.0)
                 q[moving] = np.clip(q + s * w, self.q_lower, self.q_upper)[moving]
         return q
@@ -649,6 +651,12 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
         if not model.eq_active0[e]:
             continue
         kind, coefficients = model.eq_type[e], model.eq_data[e]
+        if kind == int(mujoco.mjtEq.mjEQ_CONNECT):
+            raise ModelError(
+                f"equality {model.eq(e).name or e} closes a loop of links, whose joints no law "
+                "here knows to be bound: drop_couplings = true leaves it out, and couplings = [{ joint, "
+                "to, ratio }] says how they move together"
+            )
         side: Callable[[mujoco.MjModel, int], tuple[np.ndarray, float]]
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
             side = _joint_row

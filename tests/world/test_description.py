@@ -83,6 +83,14 @@ def test_a_urdf_keeps_its_fixed_links_and_closes_towards_its_middle(tmp_path):
     np.testing.assert_allclose(p, 0.0, atol=EXACT)
 
 
+def test_a_finger_without_ranges_opens_and_closes_all_the_same(tmp_path):
+    xml = change(XML, 'axis="0 0 1" range="0 3"', 'axis="0 0 1"')
+    robot = written(tmp_path, xml, "drop_couplings = true\n" + SHORT)
+    ends = [robot.opened(robot.home, share) for share in (0.0, 1.0)]
+    assert np.isfinite(ends).all()
+    assert ends[0][1] < robot.home[1] < ends[1][1]
+
+
 def test_a_joint_whose_wide_side_is_negative_closes_negatively(tmp_path):
     xml = change(XML, 'axis="0 0 1" range="0 3"', 'axis="0 0 1" range="-3 0"')
     xml = change(change(xml, 'range="-0.1 0.8"', 'range="-2 2"'), 'qpos="0 0.2', 'qpos="0 -0.2')
@@ -379,12 +387,14 @@ JOINED = '[[model]]\nfile = "tiny.xml"\n[[model]]\nfile = "tiny.xml"\n[[contact_
 TWO = (
     SHORT + 'flexion = ["proximal"]\n[[contact_points]]\nlink = "palm"\nball = { radius = 0.01 }\n'
 )
+CONNECT = '<connect name="loop" body1="distal" body2="palm" anchor="0 0 0"/>'
 REFUSALS = (
     lambda folder: written(folder, NEGATIVE),
     lambda folder: written(folder, change(XML, "0 0.5 0 0 0", "-1 -1 0 0 0")),
     lambda folder: written(folder, toml=TWO + 'flexion = ["lift"]\n'),
     lambda folder: written(folder, toml=TWO),
     lambda folder: written(folder, FREE),
+    lambda folder: written(folder, change(XML, "<equality>", f"<equality>{CONNECT}")),
     lambda folder: robot_of(claw(folder, '<mesh filename="tip.dae"/>')),
     lambda folder: robot_of(claw(folder, '<mesh filename="package://claw/tip.stl"/>')),
     lambda folder: written(folder, change(XML, ' angle="radian"', "")),
