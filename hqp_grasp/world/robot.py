@@ -654,8 +654,8 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
         if kind == int(mujoco.mjtEq.mjEQ_CONNECT):
             raise ModelError(
                 f"equality {model.eq(e).name or e} closes a loop of links, whose joints no law "
-                "here knows to be bound: drop_couplings = true leaves it out, and couplings = [{ joint, "
-                "to, ratio }] says how they move together"
+                "here knows to be bound: drop_couplings = true leaves it out, and "
+                "couplings = [{ joint, to, ratio }] says how they move together"
             )
         side: Callable[[mujoco.MjModel, int], tuple[np.ndarray, float]]
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
