@@ -43,6 +43,7 @@ COMMANDS_ON = [
     "looking.md",
     "many-trials.md",
     "objects.md",
+    "physics.md",
     "quickstart.md",
     "real-hand.md",
     "results.md",
