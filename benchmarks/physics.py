@@ -24,7 +24,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 import hqp_grasp as hg
-from hqp_grasp.experiments.record import BEYOND, CONVERGED_FORCE, CONVERGED_MOMENT
+from hqp_grasp.control.settling import BEYOND
+from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 from hqp_grasp.experiments.start import FirstTouch
 from hqp_grasp.touch.imperfections import FAULTS, Fault
 
