@@ -122,6 +122,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,physics-faults,benchmarks/physics.py faults --trials 25)
 	$(call keep,physics-speed,benchmarks/physics.py speed)
 	$(call keep,prisms,benchmarks/prisms.py --seed 0)
+	$(call keep,noise,benchmarks/noise.py --trials 40 --seed 50)
 	$(call keep,polygons,benchmarks/polygons.py --polygons 20 --starts 50 --seed 0)
 	$(call keep,probing,benchmarks/probing.py)
 	$(call keep,probing-joints,benchmarks/probing.py --robots bhand wam_bhand umass_torso --joints 8 16 24 32 40)
