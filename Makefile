@@ -1,7 +1,7 @@
 # Two commands do all the set-up: `make demo` and `make test`. They need git, python3, make and a POSIX shell.
 
 PYTHON ?=            # builds .venv; left empty, the first on the path that is new enough
-PYTEST_ARGS ?=       # such as `-n 2`, to run tests in two processes
+PYTEST_ARGS ?= -n 2  # tests in two processes; left empty, in one
 
 VENV := .venv
 PY := $(VENV)/bin/python

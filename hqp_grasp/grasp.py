@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
@@ -140,17 +141,17 @@ class Grasp:
         """Number of independent joints."""
         return len(self.q)
 
-    @property
+    @cached_property
     def positions(self) -> np.ndarray:
         """Contact positions (k, 3) [m], world."""
-        return np.array([c.position for c in self.contacts])
+        return as_array("Grasp.positions", [c.position for c in self.contacts], (self.k, 3))
 
-    @property
+    @cached_property
     def normals(self) -> np.ndarray:
         """Outward unit normals (k, 3), world."""
-        return np.array([c.normal for c in self.contacts])
+        return as_array("Grasp.normals", [c.normal for c in self.contacts], (self.k, 3))
 
-    @property
+    @cached_property
     def floor(self) -> tuple[float, float]:
         """ε_f [N²] and ε_m [(N·m)²] that noise makes of these contacts in balance, on average.
 

@@ -13,7 +13,7 @@ from hqp_grasp.control.aim import Aim
 from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, cap_ratio
 from hqp_grasp.control.memory import SurfaceMemory, steadied
 from hqp_grasp.control.paper import laws, paper_levels, why_not
-from hqp_grasp.control.settling import ease, way_back
+from hqp_grasp.control.settling import Course
 from hqp_grasp.errors import one_of
 from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
@@ -202,7 +202,8 @@ class HierarchyForm:
         last = [touch.felt for touch in history].index(grasp)
         history = steadied(history)
         grasp = history[last].felt  # type: ignore[assignment]
-        back = way_back(stack, history, left)
+        course = Course.of(stack, history)
+        back = course.way_back(left)
         if back is not None:
             return self._back(stack, grasp, back, begin)
         careful = careful or (len(history) <= self.careful_for and _fingers_lean(stack, grasp))
@@ -215,10 +216,9 @@ class HierarchyForm:
         gain = min(1.0, force[0].gain, moment[0].gain)
         aims = Aim.each(memory, grasp)
         aims = aims[min(misses // 2, len(aims) - 1) :][:TRIED]
-        lower = ease(stack, history)
         steps = []
         for aim in aims:
-            steps.append(self._towards(aim, gain, stack, lower))
+            steps.append(self._towards(aim, gain, stack, course.ease))
             if steps[-1].missing < REACHED:
                 break
         step = min(steps, key=lambda step: step.missing)
@@ -227,12 +227,12 @@ class HierarchyForm:
         gap = None if limit_active else float(np.abs(step.solution.x - step.unlimited).max())
         return Plan(step.solution.x, step.solution, limit_active, gap, solve_us)
 
-    def _towards(self, aim: Aim, gain: float, stack: Stack, lower: float) -> _Step:
+    def _towards(self, aim: Aim, gain: float, stack: Stack, ease: float) -> _Step:
         grasp, share = aim.grasp, gain
         projection = Projection(rank_tolerance=self.hqp.rank_tolerance)
         for _ in range(SHORTENINGS):
             aimed, rest = aim.levels(stack, share)
-            rest = [Level.equal(v.A, lower * share / gain * v.upper, v.name) for v in rest]
+            rest = [Level.equal(v.A, ease * share / gain * v.upper, v.name) for v in rest]
             unlimited = projection.solve(aimed + rest).x
             ratio = cap_ratio(unlimited, stack, grasp)
             if ratio <= 1.0 + CAP_TOLERANCE:

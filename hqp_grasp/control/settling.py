@@ -20,43 +20,25 @@ PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
 
 
-def way_back(stack: Stack, history: Sequence[Touch], left: int | None) -> np.ndarray | None:
-    """The posture (n,) [rad] to return to, or None while there is reason to go on.
-
-    Balanced grasps are kept: once the laws below force and moment improve no more, once a step from
-    a balanced grasp lost it, and when the touches `left` only just suffice. A grasp that is not
-    there any more, because the object has moved, is forgotten. Under noise a grasp is balanced
-    within BEYOND times its floor, and BETTER shows in as many grasps as average the noise to it.
-    """
-    course = _Course.of(stack, history)
-    best = course.best
-    if best >= 0 and course.over:
-        return history[best].felt.q  # type: ignore[union-attr]
-    if left is not None:
-        best = best if best >= 0 else int(course.scores.argmin())
-        q: np.ndarray = history[best].felt.q  # type: ignore[union-attr]
-        last = [t.felt for t in history if isinstance(t.felt, Grasp)][-1]
-        if left <= 1.0 + cap_ratio(q - last.q, stack, last):
-            return q
-    return None
-
-
-def ease(stack: Stack, history: Sequence[Touch]) -> float:
-    """Share of the lower laws' step to take: half of it for each balanced grasp it made worse."""
-    return 0.5 ** _Course.of(stack, history).worse
-
-
 @dataclass(frozen=True, eq=False)
-class _Course:
-    """How the touches of a history went."""
+class Course:
+    """How the touches of a history went, by the laws of a stack.
 
+    Under noise a grasp is balanced within BEYOND times its floor, and BETTER shows in as many
+    grasps as average the noise to it. A grasp that is not there any more, because the object has
+    moved, is forgotten.
+    """
+
+    stack: Stack
+    history: Sequence[Touch]
     scores: np.ndarray  # of each touch, inf for misses
     best: int  # touch with the best of the balanced grasps, −1: none
     worse: int  # balanced grasps that were worse than the best before
     over: bool  # whether it is time to go back
 
     @classmethod
-    def of(cls, stack: Stack, history: Sequence[Touch]) -> _Course:
+    def of(cls, stack: Stack, history: Sequence[Touch]) -> Course:
+        """Of a history with one grasp at least."""
         hits = [t.felt for t in history if isinstance(t.felt, Grasp)]
         score = iter(_scores(hits))
         scores = np.array([next(score) if isinstance(t.felt, Grasp) else np.inf for t in history])
@@ -77,7 +59,29 @@ class _Course:
                 lost = True
                 if isinstance(touch.felt, Grasp) and _near(touch.q_target, history[best]):
                     best, stale, lost = -1, 0, False
-        return cls(scores, best, worse, lost or stale >= patience)
+        return cls(stack, history, scores, best, worse, lost or stale >= patience)
+
+    @property
+    def ease(self) -> float:
+        """Share of the lower laws' step to take: half of it for each grasp that it made worse."""
+        return 0.5**self.worse
+
+    def way_back(self, left: int | None) -> np.ndarray | None:
+        """The posture (n,) [rad] to return to, or None while there is reason to go on.
+
+        Balanced grasps are kept: once the laws below force and moment improve no more, once a step
+        from a balanced grasp lost it, and when the touches `left` only just suffice.
+        """
+        best = self.best
+        if best >= 0 and self.over:
+            return self.history[best].felt.q  # type: ignore[union-attr]
+        if left is not None:
+            best = best if best >= 0 else int(self.scores.argmin())
+            q: np.ndarray = self.history[best].felt.q  # type: ignore[union-attr]
+            last = [t.felt for t in self.history if isinstance(t.felt, Grasp)][-1]
+            if left <= 1.0 + cap_ratio(q - last.q, self.stack, last):
+                return q
+        return None
 
 
 def _scores(hits: Sequence[Grasp]) -> np.ndarray:

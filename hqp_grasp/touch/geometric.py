@@ -62,7 +62,7 @@ class GeometricProbe:
     scene: Scene
     links: str = "block"  # or "pass"
     _local: threading.local = field(init=False, repr=False)  # each thread's own MjData
-    _links: np.ndarray = field(init=False, repr=False)  # geom ids of all else that can touch
+    _links: tuple[int, ...] = field(init=False, repr=False)  # geom ids of all else that can touch
     _objects: tuple[int, ...] = field(init=False, repr=False)  # geom ids of what is felt
     _round: tuple[bool, ...] = field(init=False, repr=False)  # each contact point is one ball
     _may_aim: bool = field(init=False, repr=False)  # some finger closes with several joints
@@ -81,8 +81,8 @@ class GeometricProbe:
         tips = {g for geoms in robot.geoms for g in geoms}
         objects = touching & (model.geom_bodyid == model.body(OBJECT).id)
         put("_objects", tuple(int(g) for g in np.flatnonzero(objects)))
-        links = [g for g in np.flatnonzero(touching & ~objects) if g not in tips]
-        put("_links", np.array(links, dtype=int))
+        links = np.flatnonzero(touching & ~objects).tolist()
+        put("_links", tuple(g for g in links if g not in tips))
 
     @property
     def _data(self) -> mujoco.MjData:
@@ -135,10 +135,14 @@ class GeometricProbe:
 
     def _others(self) -> tuple[str, ...]:
         """Links beside the contact points that are in the object, as the hand stands."""
+        model, data = self.scene.model, self._data
         return tuple(
-            self.scene.model.geom(int(link)).name
+            model.geom(link).name
             for link in self._links
-            if self._distance(int(link), 0.0) < -OVERLAP
+            if any(
+                mujoco.mj_geomDistance(model, data, link, o, 0.0, None) < -OVERLAP
+                for o in self._objects
+            )
         )
 
     def _close(

@@ -11,7 +11,7 @@ from hqp_grasp.control.aim import Aim
 from hqp_grasp.control.controller import Controller
 from hqp_grasp.control.memory import SAME_PLACE, SLACK, UNDECIDED, SurfaceMemory, steadied
 from hqp_grasp.control.outline import Outline, directions, wrapped
-from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, PATIENCE, ease, way_back
+from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, PATIENCE, Course
 from hqp_grasp.errors import InputError
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
@@ -284,8 +284,8 @@ def test_under_noise_balance_is_judged_by_its_floor_and_patience_grows(cylinder,
     felt = [dataclasses.replace(c, noise=noise) for c in good.contacts]
     unsure = dataclasses.replace(good, contacts=tuple(felt))
     history = [Touch(good.q, good)] * (PATIENCE + 1)
-    np.testing.assert_array_equal(way_back(stack, history, None), good.q)
-    assert way_back(stack, [Touch(good.q, unsure)] * (PATIENCE + 1), None) is None
+    np.testing.assert_array_equal(Course.of(stack, history).way_back(None), good.q)
+    assert Course.of(stack, [Touch(good.q, unsure)] * (PATIENCE + 1)).way_back(None) is None
     # A push aside that is within the floor, but beyond the goals of an exact sensor.
     n = felt[0].normal + np.array([0.0, 0.0, 1.5 * np.sqrt(FORCE_GOAL)])
     for contact, lost in ((dataclasses.replace(felt[0], noise=0.0), True), (felt[0], False)):
@@ -295,7 +295,7 @@ def test_under_noise_balance_is_judged_by_its_floor_and_patience_grows(cylinder,
         assert ForceTask().potential(grasp) > FORCE_GOAL
         assert (ForceTask().potential(grasp) > BEYOND * grasp.floor[0]) == lost
         history = [Touch(good.q, unsure), Touch(good.q + 0.1, grasp)]
-        assert (way_back(stack, history, None) is not None) == lost
+        assert (Course.of(stack, history).way_back(None) is not None) == lost
 
 
 def test_a_step_that_overshot_is_followed_by_shorter_ones(cylinder, first):
@@ -304,9 +304,9 @@ def test_a_step_that_overshot_is_followed_by_shorter_ones(cylinder, first):
     good = probed(cylinder, first, 12).grasps[-1]
     worse = dataclasses.replace(good, jacobian=_turned(good.jacobian, 0.1))
     history = [Touch(good.q, good)]
-    assert ease(stack, history) == 1.0
-    assert ease(stack, [*history, Touch(good.q, worse)]) == 0.5
-    assert ease(stack, [*history, Touch(good.q, worse), Touch(good.q, worse)]) == 0.25
+    assert Course.of(stack, history).ease == 1.0
+    assert Course.of(stack, [*history, Touch(good.q, worse)]).ease == 0.5
+    assert Course.of(stack, [*history, Touch(good.q, worse), Touch(good.q, worse)]).ease == 0.25
 
 
 def _turned(jacobian, angle):
@@ -453,11 +453,11 @@ def test_a_balanced_grasp_is_kept_once_a_step_from_it_missed(cylinder, first):
     record = probed(cylinder, first, 6)
     good = record.grasps[-1]
     history = [Touch(first.q, first), Touch(good.q, good)]
-    assert way_back(stack, history, None) is None
+    assert Course.of(stack, history).way_back(None) is None
     history.append(Touch(good.q + 0.1, Missed(Miss.NO_TOUCH, "finger_1")))
-    np.testing.assert_array_equal(way_back(stack, history, None), good.q)
+    np.testing.assert_array_equal(Course.of(stack, history).way_back(None), good.q)
     history.append(Touch(good.q, first))  # it is not there any more
-    assert way_back(stack, history, None) is None
+    assert Course.of(stack, history).way_back(None) is None
 
 
 def test_the_best_grasp_is_returned_to_as_the_budget_runs_out(cylinder, first):
@@ -465,8 +465,8 @@ def test_the_best_grasp_is_returned_to_as_the_budget_runs_out(cylinder, first):
     record = probed(cylinder, first, 3)
     better, worse = record.grasps[1], record.grasps[0]
     history = [Touch(better.q, better), Touch(worse.q, worse)]
-    assert way_back(stack, history, 30) is None
-    np.testing.assert_array_equal(way_back(stack, history, 1), better.q)
+    assert Course.of(stack, history).way_back(30) is None
+    np.testing.assert_array_equal(Course.of(stack, history).way_back(1), better.q)
 
 
 def test_stacks_without_force_and_moment_are_the_plain_hierarchy(cylinder, first):
