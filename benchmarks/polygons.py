@@ -1,7 +1,7 @@
 """How sure and how quick grasps are on convex polygons that nobody tuned to.
 
     python benchmarks/polygons.py --polygons 20 --starts 50 --seed 0
-    python benchmarks/polygons.py --shapes cylinder hexagon --starts 200 --seed 0
+    python benchmarks/polygons.py --shapes box_6 box_8 box_10 triangle pentagon octagon --starts 80
 
 A polygon has 5–8 sides, none under 2 cm, and holds a circle of 3–6 cm. "Good" is good in every
 respect: balanced to the last probe, never a link inside, no limit violated, no error.
@@ -10,28 +10,28 @@ respect: balanced to the last probe, never a link inside, no limit violated, no 
 from __future__ import annotations
 
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import tyro
+from tqdm import tqdm
 
 import hqp_grasp as hg
-from hqp_grasp.grasp import Contact, Grasp, Missed
-from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.experiments.executor import run_all
 
 SIDES = (5, 8)
 SHORTEST = 0.02  # [m]
 INRADIUS = (0.03, 0.06)  # [m]
 FARTHEST = 0.10  # [m] of a corner from the middle of the largest circle inside
 QUICK = 20  # probes
-NOISY_FORCE, NOISY_MOMENT = 5e-3, 4e-3  # [N²], [N·m] true errors that count under noise
 NAMED: dict[str, hg.Cylinder | hg.Prism] = {
     "cylinder": hg.Cylinder(0.05),
     "cylinder_65": hg.Cylinder(0.065),
     "hexagon": hg.Prism.regular(6, 0.06),
+    "triangle": hg.Prism.regular(3, 0.09),
     **{f"box_{cm}": hg.Prism.regular(4, cm / 100.0) for cm in (6, 8, 10)},
+    "pentagon": hg.Prism.regular(5, 0.06),
+    "octagon": hg.Prism.regular(8, 0.04),
 }
 
 
@@ -59,50 +59,23 @@ def polygon(rng: np.random.Generator) -> hg.Prism:
             return hg.Prism(tuple(map(tuple, corners)))
 
 
-@dataclass
-class NoisyProbe:
-    """A probe whose positions and normals are off by independent Gaussian noise."""
+@dataclass(frozen=True)
+class Work:
+    """The trials of each object, one after the other."""
 
-    probe: GeometricProbe
-    rng: np.random.Generator
-    position: float  # [m] standard deviation on each axis
-    normal: float  # [–] the same
-    last: Grasp | Missed | None = None  # what is, where the answer was what is felt
+    objects: tuple[hg.Cylinder | hg.Prism, ...]
+    trials: int
+    probes: int
+    seed: int
+    form: str
 
-    def felt(self, true: Grasp) -> Grasp:
-        """What is felt of a grasp."""
-        contacts = []
-        for c in true.contacts:
-            n = c.normal + self.normal * self.rng.normal(size=3)
-            x = c.position + self.position * self.rng.normal(size=3)
-            contacts.append(Contact(x, n / np.linalg.norm(n)))
-        return self.probe.scene.articulated.grasp(true.q, contacts, true.other_links)
-
-    def touch(self, q_target: np.ndarray) -> Grasp | Missed:
-        """Touch, and feel it with noise."""
-        self.last = self.probe.touch(q_target)
-        return self.felt(self.last) if isinstance(self.last, Grasp) else self.last
-
-
-def start(
-    scene: hg.Scene, form: str, probes: int, noise: bool, entropy: tuple[int, ...]
-) -> tuple[str, int | None]:
-    """How the trial from one start ended, and when it was balanced for good."""
-    trial = hg.Trial(scene, hg.stack_of("fmk"), probes, form)
-    if not noise:
-        record = trial.attempt(entropy)
+    def __call__(self, number: int) -> tuple[str, int | None]:
+        """Verdict, and the probe from which it stays balanced."""
+        s, i = divmod(number, self.trials)
+        scene = hg.Scene(object=self.objects[s])
+        trial = hg.Trial(scene, hg.stack_of("fmk"), self.probes, self.form)
+        record = trial.attempt((self.seed, s, i))
         return record.verdict, record.converged_at
-    first = trial.start.draw(scene, GeometricProbe, np.random.default_rng(entropy)).grasp  # type: ignore[union-attr]
-    probe = NoisyProbe(GeometricProbe(scene), np.random.default_rng((*entropy, 1)), 5e-4, 0.02)
-    noisy = hg.Trial(scene, trial.stack, probes, form, start=probe.felt(first))
-    record = noisy.attempt(entropy, probe)
-    if record.error is not None or not isinstance(probe.last, Grasp):
-        return "error" if record.error is not None else "lost", None
-    balanced = (
-        hg.ForceTask().potential(probe.last) <= NOISY_FORCE
-        and np.sqrt(hg.MomentTask().potential(probe.last)) <= NOISY_MOMENT
-    )
-    return "good" if balanced else "not balanced", None
 
 
 def main(
@@ -112,7 +85,6 @@ def main(
     probes: int = 40,
     seed: int = 0,
     form: str = "hierarchy",
-    noise: bool = False,
     jobs: int = 2,
 ) -> None:
     """Print for each shape how many starts are good, how the others fail, and how many probes.
@@ -124,22 +96,19 @@ def main(
         probes: touches after the first one
         seed: of polygons and starts
         form: of the controller
-        noise: on normals (0.02 rad) and positions (0.5 mm); good is then what truly is at the end
         jobs: processes
     """
     objects = {name: NAMED[name] for name in shapes}
     if not shapes:
         rngs = [np.random.default_rng((seed, i)) for i in range(polygons)]
         objects = {f"polygon {i}": polygon(rng) for i, rng in enumerate(rngs)}
+    work = Work(tuple(objects.values()), starts, probes, seed, form)
+    numbers = range(len(objects) * starts)
+    done = dict(tqdm(run_all(work, numbers, jobs), total=len(numbers)))
     print(f"{'':14}{'good':>12}{'median':>8}{'p99':>6}{'worst':>7}{f'≤ {QUICK}':>7}  failures")
-    every: list[tuple[str, int | None]] = []
-    with ProcessPoolExecutor(jobs) as pool:
-        for s, (name, thing) in enumerate(objects.items()):
-            one = partial(start, hg.Scene(object=thing), form, probes, noise)
-            ends = list(pool.map(one, [(seed, s, i) for i in range(starts)], chunksize=4))
-            print(line(name, ends), flush=True)
-            every += ends
-    print(line("all", every))
+    for s, name in enumerate(objects):
+        print(line(name, [done[s * starts + i] for i in range(starts)]))
+    print(line("all", list(done.values())))
 
 
 def line(name: str, ends: list[tuple[str, int | None]]) -> str:
