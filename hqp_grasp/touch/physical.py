@@ -27,7 +27,8 @@ SWIFT = 1.0  # [rad/s] of closing, far from the touch that is expected
 CAREFUL = 0.2  # [rad/s] near it
 SLOW = 0.3  # [rad/s] where nothing is known
 EXPECTED = 0.08  # [rad] before and after the expected touch closing is careful
-NOTICED = 0.1  # [N] that counts as touch
+NOTICED = 0.1  # [N] that counts as touch, at least
+BEYOND_NOISE = 4.0  # times the length of one sample's noise, that does
 POLL = 0.1  # [s] between looks at the fingers while they close
 PATIENCE = 3.0  # [s] that closing may take beyond what its range and speed need
 SETTLING, PRESSING = 0.3, 0.3  # [s], [s/N] that the held force may take: a finger may slide
@@ -135,7 +136,9 @@ class PhysicalProbe:
                 return heard if isinstance(heard, Missed) else Missed(reason, fault)
         self.driver.wait(RESTING)
         free = self.driver.wait(WEIGHING)
-        missed = self._close(free, expected)
+        noise = np.sqrt(self._variance(free)[:, :3].sum(axis=1))
+        noticed = np.maximum(NOTICED, BEYOND_NOISE * noise).tolist()
+        missed = self._close(self._approach(free, expected, noticed), noticed)
         if missed is not None:
             return missed
         self.driver.hold(self.force)
@@ -171,22 +174,29 @@ class PhysicalProbe:
             left -= slice_
         return ""
 
-    def _close(self, readings: Readings, expected: np.ndarray) -> Missed | None:
-        """Close all fingers; None once all have touched."""
-        driver, limits = self.driver, self.driver.limits
-        flexion = [j for (j,) in self.robot.flexion]
-        names = [point.name for point in self.robot.description.contact_points]
+    def _approach(
+        self, readings: Readings, expected: np.ndarray, noticed: Sequence[float]
+    ) -> Readings:
+        """Close all fingers swiftly, to a little before the touch that is expected."""
+        driver, flexion = self.driver, [j for (j,) in self.robot.flexion]
         way = np.maximum(expected - EXPECTED - readings.q[-1][flexion], 0.0)
         swift = float(way.max()) / SWIFT
         if swift > 0.0:
             for i, length in enumerate(way):
                 if length > 0.0:
-                    driver.close(i, length / swift, NOTICED)
+                    driver.close(i, length / swift, noticed[i])
             readings = self._watch(driver, swift)
+        return readings
+
+    def _close(self, readings: Readings, noticed: Sequence[float]) -> Missed | None:
+        """Close what has not touched until `noticed` (k,) [N] is felt; None once all have."""
+        driver, limits = self.driver, self.driver.limits
+        flexion = [j for (j,) in self.robot.flexion]
+        names = [point.name for point in self.robot.description.contact_points]
         careful = 2.0 * EXPECTED / CAREFUL
         speed = CAREFUL
         for i in np.flatnonzero(~readings.touched).tolist():
-            driver.close(i, speed, NOTICED)
+            driver.close(i, speed, noticed[i])
         left = PATIENCE + float((limits.upper[flexion] - readings.q[-1][flexion]).max()) / SLOW
         while not readings.fault and not readings.touched.all():
             if readings.stalled.any():
@@ -202,7 +212,7 @@ class PhysicalProbe:
             if careful <= 0.0 and speed == CAREFUL:
                 speed = SLOW
                 for i in np.flatnonzero(~readings.touched).tolist():
-                    driver.close(i, speed, NOTICED)
+                    driver.close(i, speed, noticed[i])
             readings = driver.wait(POLL)
             careful, left = careful - POLL, left - POLL
         return Missed(Miss.BLOCKED, readings.fault) if readings.fault else None
@@ -264,14 +274,19 @@ class PhysicalProbe:
         return (readings.wrench * kept[..., None]).sum(axis=0) / kept.sum(axis=0)[:, None]
 
     def _unsure(self, readings: Readings) -> np.ndarray:
-        """Variance (k, 6) of these averages by noise: samples beside the middle of their two
+        """Variance (k, 6) of these averages by noise."""
+        kept = self._kept(readings).sum(axis=0)
+        return np.asarray(self._variance(readings) / np.maximum(kept, 1)[:, None])
+
+    def _variance(self, readings: Readings) -> np.ndarray:
+        """Variance (k, 6) of one sample by noise: samples beside the middle of their two
         neighbours, whose variance is 3/2 of one sample's, whatever drifts.
         """
         kept = self._kept(readings)
         threes = kept[2:] & kept[1:-1] & kept[:-2]
         beside = 0.5 * np.diff(readings.wrench, n=2, axis=0) * threes[..., None]
-        most = np.maximum(threes.sum(axis=0) * kept.sum(axis=0), 1)
-        return np.asarray((beside**2).sum(axis=0) / (1.5 * most[:, None]))
+        count = np.maximum(threes.sum(axis=0), 1)[:, None]
+        return np.asarray((beside**2).sum(axis=0) / (1.5 * count))
 
     def _kept(self, readings: Readings) -> np.ndarray:
         """Samples (t, k) that are no spikes."""

@@ -27,6 +27,7 @@ CONTACTS = {
 SUPPORTS = ("fixed", "pedestal", "table")
 SPIN_FRICTION = 0.02  # [m] torque about the normal that a contact transmits, by normal force
 SAMPLING = 0.01  # [s] between readings
+ZEROING = 0.05  # [s] of samples, from whose median closing counts the change of force
 PEAK = 1.875  # a minimum-jerk ramp's fastest speed, by its mean
 SPEED_SHARE = 0.8  # of a joint's speed limit that a move is planned with
 CARRY_SPEED = 0.12  # [m/s] at which the arm carries the tips: a bump stays below the force limit
@@ -119,15 +120,27 @@ class SimulatedHand:
         self._rollout = Rollout(nthread=0)
         self._dt = timestep
         self._every = max(1, round(SAMPLING / timestep))
+        self._zeroing = max(self._every, round(ZEROING / timestep))
         model, robot = self.model, self.robot
         names = [robot.model.joint(j).name for j in range(robot.model.njnt)]
-        self._all = np.array([model.joint(j).qposadr[0] for j in names])
-        self._q = np.array([model.joint(j).qposadr[0] for j in robot.joints])
-        self._v = np.array([model.joint(j).dofadr[0] for j in robot.joints])
-        self._servo = _servos(model, robot.joints)
-        self._kp = model.actuator_gainprm[self._servo, 0]
-        lag = -model.actuator_biasprm[self._servo, 2] / self._kp
-        self._lag = lag  # [s] a servo stays behind its target, by speed
+        simulated = {model.joint(j).name for j in range(model.njnt)}
+        self._all = np.flatnonzero([name in simulated for name in names])
+        self._at = np.array([model.joint(names[j]).qposadr[0] for j in self._all])
+        self._driven = np.flatnonzero(~robot.idle)
+        driven = tuple(robot.joints[j] for j in self._driven)
+        # States end with the joints that stand, and their speed.
+        size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._standing = np.append(robot.home[robot.idle], 0.0)
+        self._size = size
+        self._q, self._v = np.zeros(n, dtype=int), np.full(n, size + len(self._standing) - 1)
+        self._q[robot.idle] = size + np.arange(robot.idle.sum())
+        self._q[self._driven] = [1 + model.joint(j).qposadr[0] for j in driven]
+        self._v[self._driven] = [1 + model.nq + model.joint(j).dofadr[0] for j in driven]
+        self._servo = _servos(model, driven)
+        self._kp, self._lag = np.ones(n), np.zeros(n)
+        self._kp[self._driven] = kp = model.actuator_gainprm[self._servo, 0]
+        # [s] a servo stays behind its target, by speed
+        self._lag[self._driven] = -model.actuator_biasprm[self._servo, 2] / kp
         points = robot.description.contact_points
         self._tips = [model.geom(name).id for name in _round_tips(robot)]
         self._sites = [model.site(p.site).id for p in points]
@@ -141,9 +154,9 @@ class SimulatedHand:
         ]
         first = model.sensor(f"{points[0].name} touch force").adr[0]
         self._wrench = slice(first, first + 6 * k)
-        first = model.sensor(f"{robot.joints[0]} torque").adr[0]
-        self._torque = slice(first, first + n)
-        torque = model.actuator_forcerange[self._servo, 1]
+        first = model.sensor(f"{driven[0]} torque").adr[0]
+        self._torque = slice(first, first + len(driven))
+        torque = robot.model.actuator_forcerange[_servos(robot.model, robot.joints), 1]
         self.limits = DriverLimits(
             robot.q_lower, robot.q_upper, robot.velocity, torque, force_limit, watchdog
         )
@@ -177,8 +190,8 @@ class SimulatedHand:
                     f"SimulatedHand.place: {inside}, with open fingers; begin further away from it"
                 )
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        self._state = np.zeros(mujoco.mj_stateSize(model, kind))
-        mujoco.mj_getState(model, data, self._state, kind)
+        self._state = np.append(np.zeros(self._size), self._standing)
+        mujoco.mj_getState(model, data, self._state[: self._size], kind)
         self._warm = np.zeros(model.nv)
         self._goal = q.copy()  # (n,) [rad] the commanded posture, as encoders have it
         self._play = q.copy()  # (n,) [rad] what the joints are told of it
@@ -204,8 +217,8 @@ class SimulatedHand:
         """Put hand and object in their places; return which of its geoms is in what, if any."""
         robot, model, data = self.robot, self.model, self._data
         mujoco.mj_resetData(model, data)
-        data.qpos[self._all] = robot.coupling @ q + robot.offset
-        data.ctrl[self._servo] = q
+        data.qpos[self._at] = (robot.coupling @ q + robot.offset)[self._all]
+        data.ctrl[self._servo] = q[self._driven]
         mujoco.mj_forward(model, data)
         for contact in data.contact[: data.ncon]:
             one, other = contact.geom.tolist()
@@ -218,7 +231,8 @@ class SimulatedHand:
     def truth(self) -> Truth:
         """What is, now."""
         model, data = self.model, self._data
-        mujoco.mj_setState(model, data, self._state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        state = self._state[: self._size]
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         mujoco.mj_forward(model, data)
         k = len(self._tips)
         normals: list[np.ndarray | None] = [None] * k
@@ -260,7 +274,7 @@ class SimulatedHand:
                 for c, r, v in zip(centers, self.robot.tip_radius, normals, strict=True)
                 if v is not None
             ]
-            grasp = self.robot.grasp(data.qpos[self._q], contacts, tuple(dict.fromkeys(links)))
+            grasp = self.robot.grasp(self._state[self._q], contacts, tuple(dict.fromkeys(links)))
         moved = turned = 0.0
         if self._free:
             pose = data.joint(OBJECT).qpos
@@ -300,7 +314,7 @@ class SimulatedHand:
         self._guard[:] = GUARD * self.limits.force
         j = self._flexion[finger]
         if self._mode[finger] != CLOSING:
-            self._zero[finger] = self._middle()[finger]
+            self._zero[finger] = np.median(self._last[:, finger, :3], axis=0)
             self._now[finger] = 0.0
         self._mode[finger] = CLOSING
         self._speed[finger] = min(speed, SPEED_SHARE * self.limits.speed[j])
@@ -349,7 +363,7 @@ class SimulatedHand:
                 self._tail = late[done : done + self._late]
             if done < T:
                 self._warm = np.zeros_like(self._warm)
-            self._last = reading[max(0, done - self._every) : done]
+            self._last = np.concatenate([self._last, reading[:done]])[-self._zeroing :]
             states.append(state[:done])
             felt.append(reading[:done])
             torques.append(sensors[:done, self._torque])
@@ -406,7 +420,7 @@ class SimulatedHand:
         for i in self._errors.stalled(float(self._state[0])):
             j = self._flexion[i]
             told[:, j], speed[:, j] = self._play[j], 0.0
-        ctrl[:, self._servo] = told + self._lag * speed
+        ctrl[:, self._servo] = (told + self._lag * speed)[:, self._driven]
         self._planned = goal, speed, told
         return ctrl
 
@@ -425,12 +439,12 @@ class SimulatedHand:
     def _run(self, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Simulate; states (T, ·) after each step, and sensors (T, ·) during it."""
         T = len(ctrl)
-        states = np.empty((1, T, len(self._state)))
+        states = np.empty((1, T, self._size))
         sensors = np.empty((1, T, self.model.nsensordata))
         self._rollout.rollout(
             [self.model],
             [self._data],
-            self._state[None],
+            self._state[None, : self._size],
             ctrl[None],
             skip_checks=True,
             nstep=T,
@@ -440,6 +454,9 @@ class SimulatedHand:
         )
         self._warm = self._data.qacc_warmstart.copy()
         self.simulated += T
+        if len(self._standing) > 1:
+            standing = np.broadcast_to(self._standing, (T, len(self._standing)))
+            return np.concatenate([states[0], standing], axis=1), sensors[0]
         return states[0], sensors[0]
 
     def _react(self, state: np.ndarray, wrench: np.ndarray) -> int:
@@ -455,7 +472,7 @@ class SimulatedHand:
             if over.any():
                 first = int(np.argmax(over.any(axis=1)))
                 what = ("guard", int(np.argmax(over[first])))
-        behind = goal - self._errors.encoder_offset - state[:, 1 + self._q]
+        behind = goal - self._errors.encoder_offset - state[:, self._q]
         closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
         if closing:
             j = self._flexion[closing]
@@ -517,7 +534,8 @@ class SimulatedHand:
 
     def _middle(self) -> np.ndarray:
         """Force (k, 3) [N] at the tips lately: the median, for a spike is nothing."""
-        return np.sort(self._last[:, :, :3], axis=0)[len(self._last) // 2]
+        lately = self._last[-self._every :, :, :3]
+        return np.sort(lately, axis=0)[len(lately) // 2]
 
     def _begin_holding(self, i: int) -> None:
         j = self._flexion[i]
@@ -529,7 +547,7 @@ class SimulatedHand:
         self._goal[j] = min(q[j] + self._give[i] * self._force[i], self._upper[j])
 
     def _measured(self) -> np.ndarray:
-        return self._errors.joints(self._state[1 + self._q])
+        return self._errors.joints(self._state[self._q])
 
     def _rest(self) -> None:
         self._mode = [IDLE] * len(self._mode)
@@ -540,11 +558,12 @@ class SimulatedHand:
     def _readings(
         self, states: np.ndarray, felt: np.ndarray, torques: np.ndarray, true: np.ndarray
     ) -> Readings:
-        velocity = states[:, 1 + self.model.nq + self._v]
-        q = self._errors.joints(states[:, 1 + self._q])
+        velocity = states[:, self._v]
+        q = self._errors.joints(states[:, self._q])
         outside = np.maximum(self.limits.lower - q.min(axis=0), q.max(axis=0) - self.limits.upper)
         speed = np.maximum(velocity.max(axis=0), -velocity.min(axis=0)) / self.limits.speed
-        torque = np.maximum(torques.max(axis=0), -torques.min(axis=0)) / self.limits.torque
+        torque = np.maximum(torques.max(axis=0), -torques.min(axis=0))
+        torque /= self.limits.torque[self._driven]
         force = math.sqrt(_squares(true[..., :3]).max())
         for name, value in zip(
             self.worst, (outside.max(), speed.max(), torque.max(), force), strict=True
@@ -662,7 +681,8 @@ def _model(scene: Scene, physics: Physics, links: str) -> mujoco.MjModel:
                 objtype=mujoco.mjtObj.mjOBJ_SITE,
                 objname=point.site,
             )
-    for joint in robot.joints:
+    _brake(spec, robot)
+    for joint in np.array(robot.joints)[~robot.idle].tolist():
         spec.add_sensor(
             name=f"{joint} torque",
             type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
@@ -677,6 +697,35 @@ def _model(scene: Scene, physics: Physics, links: str) -> mujoco.MjModel:
         model.body_inertia[body] *= share
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _brake(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Fix at home the joints that move no contact point, as those of another arm."""
+    model, data = robot.model, mujoco.MjData(robot.model)
+    robot.place(data, robot.home)
+    fixed = np.flatnonzero(~robot.coupling[:, ~robot.idle].any(axis=1))
+    names = {model.joint(int(j)).name for j in fixed}
+    if not robot.idle.any():
+        return
+    for link in spec.bodies:
+        joints = [joint for joint in link.joints if joint.name in names]
+        if not joints:
+            continue
+        body = model.body(link.name).id
+        parent = int(model.body_parentid[body])
+        back, away = np.zeros(4), data.xpos[body] - data.xpos[parent]
+        mujoco.mju_negQuat(back, data.xquat[parent])
+        mujoco.mju_rotVecQuat(link.pos, away, back)
+        mujoco.mju_mulQuat(link.quat, back, data.xquat[body])
+        link.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        for joint in joints:
+            spec.delete(joint)
+    for equality in list(spec.equalities):
+        if {equality.name1, equality.name2} & names:
+            spec.delete(equality)
+    for actuator in list(spec.actuators):
+        if actuator.target in names:
+            spec.delete(actuator)
 
 
 def _foot(scene: Scene) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import pytest
 
 import hqp_grasp as hg
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT, balanced
+from hqp_grasp.touch import physical
 from hqp_grasp.touch.imperfections import FAULTS, PRESETS, Fault, SensorErrors
 from hqp_grasp.touch.physical import payload, weight
 
@@ -461,3 +462,53 @@ def test_a_hand_in_the_object_is_refused(scene):
     inside[3] -= 0.3
     with pytest.raises(hg.InputError, match="is in the object, with open fingers"):
         hg.SimulatedHand(scene).place(inside)
+
+
+@pytest.mark.parametrize("beyond", [physical.BEYOND_NOISE, 0.0])
+def test_noise_of_the_sensors_is_not_taken_for_touch(scene, monkeypatch, beyond):
+    """What counts as touch follows from the noise heard in free air; else fingers stop short."""
+    monkeypatch.setattr(physical, "BEYOND_NOISE", beyond)
+    noisy = hg.Physics(timestep=0.004, imperfections=hg.Imperfections(force_noise=0.04))
+    rngs = [np.random.default_rng(seed) for seed in range(3)]
+    felt = [touch(scene, noisy, links="pass", rng=rng)[1] for rng in rngs]
+    assert all(isinstance(v, hg.Grasp) for v in felt) == (beyond > 0.0)
+
+
+# ---------------------------------------------------------------- another arm
+
+
+@pytest.fixture(scope="module")
+def torso():
+    return hg.Scene(robot="umass_torso", object=hg.Cylinder(0.065))
+
+
+def test_an_arm_that_touches_nothing_stands_where_kinematics_have_it(torso):
+    hand, robot = hg.SimulatedHand(torso), torso.articulated
+    read = hand.wait(0.1)
+    assert robot.idle.sum() == 11
+    np.testing.assert_array_equal(read.q[:, robot.idle], np.tile(robot.home[robot.idle], (10, 1)))
+    assert not read.velocity[:, robot.idle].any()
+    names = [robot.model.body(i).name for i in range(1, robot.model.nbody)]
+    places = dict(zip(names, robot.bodies(robot.home)[0][1:], strict=True))
+    hand.truth()  # where bodies are, now
+    for name in names:
+        if name.startswith("left"):
+            np.testing.assert_allclose(hand._data.body(name).xpos, places[name], atol=1e-12)
+
+
+def test_what_asks_that_arm_to_move_is_told_that_it_does_not(torso):
+    hand, robot = hg.SimulatedHand(torso), torso.articulated
+    hand.move(robot.home + 0.2 * robot.idle, 0.5)
+    assert re.search(r"something holds left_\w+: it does not follow", hand.wait(0.9).fault)
+
+
+def test_the_torso_feels_by_force_what_it_touches_by_geometry(torso):
+    probe = hg.GeometricProbe(torso)
+    exact = hg.Start().draw(torso, lambda _: probe, np.random.default_rng(0)).grasp
+    hand = hg.SimulatedHand(torso)
+    hand.place(exact.q)
+    felt = hg.PhysicalProbe(hand, torso.articulated).touch(exact.q)
+    assert isinstance(felt, hg.Grasp)
+    np.testing.assert_allclose(felt.positions, exact.positions, atol=PLACE)
+    idle = torso.articulated.idle
+    np.testing.assert_allclose(felt.q[idle], exact.q[idle], atol=1e-12)
