@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tiny_hand
 from surfaces import nearest_on_circle, nearest_on_polygon
-from tiny_hand import LENGTH, STIFF, TIP, change
+from tiny_hand import LENGTH, STIFF, TIP, TOML, change
 
 from hqp_grasp.control.limits import StepLimit
 from hqp_grasp.errors import InputError
@@ -228,6 +228,20 @@ def test_the_first_touch_of_a_swinging_finger_is_where_trigonometry_puts_it(tmp_
         np.testing.assert_allclose(
             contact.position, [*(center - TIP * normal), 0.1], atol=SURFACE_TOL
         )
+
+
+def test_a_flat_touches_a_round_object_where_it_is_tangent(tmp_path):
+    """The end of the flat, 8 mm away, does not draw the place of the touch away."""
+    flat = change(STIFF, 'type="sphere" size="0.01"', 'type="box" size="0.02 0.01 0.01"')
+    tiny_hand.write(tmp_path, flat, change(TOML, 'site = "tip_center"\n', ""))
+    radius, along = 0.05, LENGTH + 0.012
+    middle = (0.0, np.hypot(along, radius + 0.01), 0.0)
+    scene = Scene(tmp_path, Cylinder(radius), middle)
+    grasp = GeometricProbe(scene).touch(np.array([0.0, 0.2]))
+    assert isinstance(grasp, Grasp), grasp
+    contact = grasp.contacts[0]
+    on_surface = np.array(scene.position) + radius * contact.normal
+    np.testing.assert_allclose(contact.position[:2], on_surface[:2], atol=5e-4)
 
 
 def test_a_face_is_met_flat(tmp_path):
