@@ -18,6 +18,7 @@ BETTER = 2e-3  # by which the lower laws' errors fall, or the grasp is no better
 SURE = 2.0  # standard errors that tell two values apart
 PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
+SAME_ROUNDING = 1e-6  # [m] radii of one tip differ by, as long as it is a ball
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +64,18 @@ class Course:
 
     @property
     def ease(self) -> float:
-        """Share of the lower laws' step to take: half of it for each grasp that it made worse."""
-        return 0.5**self.worse
+        """Share of the lower laws' step to take: half of it for each balanced grasp it made worse.
+
+        Tips that are no balls touch now with a flat and now with an edge, elsewhere than predicted,
+        and the more so the farther a step turns them. With them half is taken also for each grasp
+        felt that was not balanced, the first left out.
+        """
+        halvings = self.worse
+        hits = [t.felt for t in self.history if isinstance(t.felt, Grasp)]
+        radii = np.array([[contact.tip_radius for contact in grasp.contacts] for grasp in hits])
+        if np.ptp(radii, axis=0).max() > SAME_ROUNDING:
+            halvings += int((self.scores[np.isfinite(self.scores)] > 1.0).sum()) - 1
+        return 0.5 ** max(halvings, 0)
 
     def way_back(self, left: int | None) -> np.ndarray | None:
         """The posture (n,) [rad] to return to, or None while there is reason to go on.

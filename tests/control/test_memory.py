@@ -309,6 +309,19 @@ def test_a_step_that_overshot_is_followed_by_shorter_ones(cylinder, first):
     assert Course.of(stack, [*history, Touch(good.q, worse), Touch(good.q, worse)]).ease == 0.25
 
 
+def test_tips_that_are_no_balls_take_shorter_steps_until_they_balance(cylinder, first):
+    """Half for each grasp that was not balanced; balls, whose radii stay, take whole steps."""
+    stack = stack_of("fmk")
+    start = probed(cylinder, first, 1).grasps[0]
+    other = tuple(dataclasses.replace(c, tip_radius=2.0 * c.tip_radius) for c in start.contacts)
+    changed = dataclasses.replace(start, contacts=other)
+    round_tips, flat_tips = ([Touch(g.q, g) for g in v] for v in ([start] * 3, [start, changed]))
+    assert ForceTask().potential(start) > FORCE_GOAL
+    assert Course.of(stack, round_tips).ease == 1.0
+    longer = [[*flat_tips, *round_tips[:i]] for i in range(3)]
+    assert [Course.of(stack, v).ease for v in longer] == [0.5, 0.25, 0.125]
+
+
 def _turned(jacobian, angle):
     """Flexions that move the contacts another way: about the vertical."""
     c, s = np.cos(angle), np.sin(angle)
