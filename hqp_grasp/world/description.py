@@ -403,7 +403,8 @@ class RobotDescription:
                 if not geom.name and (geom.contype or geom.conaffinity):
                     geom.name = f"{body.name}:{i}"
         points = [point for hand in self.hands for point in hand.contact_points]
-        if not all(point.site or point.ball for point in points):
+        spheres = {geom.name for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE}
+        if not all(p.ball or (p.site and p.geoms and spheres.issuperset(p.geoms)) for p in points):
             spec.option.ccd_tolerance, spec.option.ccd_iterations = CCD_TOLERANCE, CCD_ITERATIONS
         bodies = {body.name: body for body in spec.bodies}
         for hand in self.hands:

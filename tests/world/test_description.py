@@ -14,7 +14,7 @@ from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.clearance import SelfClearance
-from hqp_grasp.world.description import RobotDescription, locate
+from hqp_grasp.world.description import CCD_TOLERANCE, RobotDescription, locate
 from hqp_grasp.world.objects import Cylinder
 from hqp_grasp.world.robot import Robot, compiled
 from hqp_grasp.world.scene import Scene
@@ -262,6 +262,17 @@ def test_links_of_any_shape_touch_a_cylinder_where_geometry_says(tmp_path, shape
         np.testing.assert_allclose(contact.normal, [side, 0, 0], atol=1e-5)
         assert abs(contact.position[0] - side * 0.03) < 1e-6
         assert abs(contact.position[1]) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("shape", "exact"),
+    [('type="sphere" size="0.01"', False), ('type="box" size="0.01 0.01 0.01"', True)],
+)
+def test_normals_of_tips_that_are_no_balls_are_computed_to_the_last_digits(tmp_path, shape, exact):
+    """Whether or not a site marks their middle; a ball's centre gives its normal."""
+    xml = change(XML, 'type="sphere" size="0.01"', shape)
+    robot = written(tmp_path, xml, tiny_hand.TOML)
+    assert (robot.model.opt.ccd_tolerance == CCD_TOLERANCE) == exact
 
 
 def test_a_flat_touches_in_its_middle_whichever_way_it_tilts(tmp_path):
