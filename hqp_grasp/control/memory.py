@@ -19,6 +19,8 @@ LEAST_NOISE = 1e-6  # [rad]
 SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
 UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which tips decide
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
+UPRIGHT = 2e-3  # [–] the same, below which normals count alike for the axis, others the less
+AXIS_STEPS = 10  # after which the axis that rims would turn stands still, to 1e-5
 WIDEST = 2.0  # [–] balls are this many times as large as the prior one at most
 EDGE = 1e-3  # [m] a smaller ball is an edge
 EDGE_TURN = 0.5  # [–] share of the angle left, by which an edge is taken to turn on
@@ -74,22 +76,25 @@ class SurfaceMemory:
     def axis(self, grasp: Grasp) -> np.ndarray:
         """The direction (3,) along which nothing curves, as far as was felt.
 
-        It is that of the first normals, and then of all that do not lean towards it. Where normals
-        leave it open, it is the one that the contacts of `grasp` lie least along.
+        It is that of the first normals, and then of all that do not lean towards it, each by the
+        inverse of its lean: the sum of leans, not of their squares, is least, and a rim felt now
+        and then does not turn it. Where normals leave it open, it is the one that the contacts of
+        `grasp` lie least along.
         """
         p = grasp.positions - grasp.positions.mean(axis=0)
         spread = UNDECIDED * (p.T @ p) / max(float((p * p).sum()), np.finfo(float).tiny)
         weight = 0.5 ** (self.probes - self.probes.min())
-        for _ in range(3):
+        for _ in range(AXIS_STEPS):
             M = (weight[:, None] * self.normals).T @ self.normals / weight.sum() + spread
             axis = np.linalg.eigh(M)[1][:, 0]
-            weight = (np.abs(self.normals @ axis) < LEANING).astype(float)
+            lean = np.abs(self.normals @ axis)
+            weight = (lean < LEANING) / np.maximum(lean, UPRIGHT)
             if not weight.any():
                 break
         return np.asarray(axis * np.sign(axis[np.abs(axis).argmax()]))
 
     def outline(self, axis: np.ndarray, tip_radius: float) -> Outline:
-        """The surface as seen along `axis`, from normals across it."""
+        """The surface as seen along `axis`: from normals across it, and around all other points."""
         across = np.abs(self.normals @ axis) < LEANING
         first = np.eye(3)[np.abs(axis).argmin()]
         first = first - (first @ axis) * axis
@@ -99,10 +104,12 @@ class SurfaceMemory:
         n = self.normals[across] @ frame.T
         n /= np.linalg.norm(n, axis=1)[:, None]
         felt = np.arctan2(n[:, 1], n[:, 0])
-        corners, sharp = _corners(x, n, R, felt)
+        corners, sharp = _corners(x, n, felt)
         R = np.minimum(R, _beside_edges(x, n, R, felt))
-        c = np.concatenate([x - R[:, None] * n, corners])
-        return Outline.around(c, np.concatenate([R, sharp]), frame, tip_radius, felt)
+        within = self.positions[~across] @ frame.T  # of end faces and their rims
+        c = np.concatenate([x - R[:, None] * n, corners, within])
+        R = np.concatenate([R, sharp, np.zeros(len(within))])
+        return Outline.around(c, R, frame, tip_radius, felt)
 
 
 def steadied(history: Sequence[Touch]) -> tuple[Touch, ...]:
@@ -170,10 +177,8 @@ def _beside_edges(x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray)
     return largest_balls(x, n, np.tile(x[edge], (2, 1)), normal, np.inf)
 
 
-def _corners(
-    x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Discs (c, R) in the corners of neighbouring faces.
+def _corners(x: np.ndarray, n: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Discs (c, R) in the corners of faces and their neighbours, be those faces or edges.
 
     The largest that fits has R = min(d_a, d_b)/tan(half the turn), with d the way from the last
     point felt to the corner; the more often a face was found flat, the smaller it is taken to be.
@@ -189,17 +194,16 @@ def _corners(
     normal, h = n[order[last]], (n[order[last]] * x[order[last]]).sum(axis=1)
     tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
     along = (x * tangent[group]).sum(axis=1)
-    low, high, least = np.full(G, np.inf), np.full(G, -np.inf), np.full(G, np.inf)
+    low, high = np.full(G, np.inf), np.full(G, -np.inf)
     np.minimum.at(low, group, along)
     np.maximum.at(high, group, along)
-    np.minimum.at(least, group, R)
     first = np.append(last[-1] + 1 - len(felt), last[:-1] + 1)  # of each group
     spread = (felt[order[last]] - felt[order[first % len(felt)]]) % (2.0 * np.pi)
-    flat, face = high - low, least >= EDGE
+    flat = high - low
     flat[spread * FLATTER > flat] = 0.0
     flat = np.where(flat > FLAT, np.bincount(group, minlength=G) - 1.0, 0.0)
     a, b = np.arange(G), (np.arange(G) + 1) % G
-    a = a[(turn[last] < CORNER) & face[a] & face[b] & (flat[a] + flat[b] > 0.0)]
+    a = a[(turn[last] < CORNER) & (flat[a] + flat[b] > 0.0)]
     b, half = (a + 1) % G, 0.5 * turn[last[a]]
     planes = np.stack([normal[a], normal[b]], axis=1)
     solved = np.linalg.solve(
