@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from hqp_grasp.tasks import ForceTask, MomentTask, Stack
 
 DISTINCT = 10  # aims, at most
 APART = 0.01  # [m] a contact's place differs by, between two aims
+PURSUED = 8  # unbalanced grasps from which an aim is the nearest, before it seems farther
+FARTHER = 0.01  # [m] of way that it seems farther, for each grasp more
 ROOM = 0.01  # [m] kept from end faces that were felt
 STILL = 1e-6  # [m] a contact that moves less has no direction
 
@@ -32,8 +35,12 @@ class Aim:
     cost: float  # [m²]
 
     @classmethod
-    def each(cls, memory: SurfaceMemory, grasp: Grasp) -> list[Aim]:
-        """Aims that differ, the best first."""
+    def each(cls, memory: SurfaceMemory, grasp: Grasp, vain: Sequence[Grasp] = ()) -> list[Aim]:
+        """Aims that differ, the best first.
+
+        `vain` are grasps that did not balance. The aim nearest to each of them is taken to have
+        been pursued, and seems the farther, the more of them there are: another has its turn.
+        """
         rho = _tip_radii(grasp)
         a = memory.axis(grasp)
         outline = memory.outline(a, float(rho.mean()))
@@ -47,6 +54,15 @@ class Aim:
             i = int(np.argmin(np.where(left, cost, np.inf)))
             left &= np.abs(places - places[i]).max(axis=1) > APART
             aims.append(cls(grasp, a, outline, s, places[i], height, end, float(cost[i])))
+        if vain:
+            x = np.concatenate([v.positions + rho[:, None] * v.normals for v in vain])
+            there = outline.locate(x @ outline.frame.T).reshape(len(vain), -1)
+            to = np.array([aim.places for aim in aims])
+            nearest = (outline.way(there, to[:, None]) ** 2).sum(axis=-1).argmin(axis=0)
+            pursued = np.bincount(nearest, minlength=len(aims))
+            farther = FARTHER * np.maximum(pursued - PURSUED, 0.0)
+            order = np.argsort([aim.cost for aim in aims] + farther * farther, kind="stable")
+            aims = [aims[i] for i in order]
         return aims
 
     def predicted(self, share: float) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Priority, Stac
 LEANING = 0.25 * np.pi  # [rad] mean angle of fingers to normals, above which they push aside
 RECENT = 10  # touches, whose misses make the hand aim elsewhere
 TRIED = 4  # aims, at most
-REACHED = 0.1  # [–] share of the way that may be missing, or the next aim is tried
+REACHED = 0.2  # [–] share of the way that ranges may keep the hand from, or the next is tried
 NEAR = 1e-3  # [m] ways shorter than this count as that long
 SHORTENINGS = 3  # of the way to an aim, until its step fits the caps
 CAP_TOLERANCE = 1e-9  # [–] over a cap
@@ -167,12 +167,14 @@ class HierarchyForm:
     Force and moment go after the best of the places where the contacts would balance (`Aim`), and
     the other laws take what is left. The share of the way that the caps allow is taken; below it,
     the share of the other laws' step for which they leave room, half of it for each balanced grasp
-    that such a step made worse. An aim that limits keep the hand from is passed over for the next,
-    and so is one aim for every two misses among the last touches.
+    that such a step made worse. An aim is passed over for the next where, by the Jacobian, limits
+    other than caps keep the hand from its end, and so is one aim for every two misses among the
+    last touches.
 
     While fingers push along the surface rather than into it, by their mean angle to the normal, and
     where it is to be careful, the step is the PaperHierarchyForm's: slower and surer. The first is
     for the first touches only, and keeps the hand out of postures that balance but hold badly.
+    After every two misses from one grasp another of these ways, and the MemorylessForm's, is taken.
 
     Without a ForceTask and a MomentTask, and for other than two or three contacts, it is the
     MemorylessForm.
@@ -207,21 +209,27 @@ class HierarchyForm:
         if back is not None:
             return self._back(stack, grasp, back, begin)
         careful = careful or (len(history) <= self.careful_for and _fingers_lean(stack, grasp))
+        ways = ["aim", "memoryless"]
         if careful and not why_not(stack):
+            ways = ["paper", *ways]
+        misses = _misses_since_a_grasp(history) % len(self.shares)  # after so many it begins again
+        way = ways[misses // 2 % len(ways)]
+        if way == "paper":
             return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
-        if _misses_since_a_grasp(history) // 2 % 2 == 1:  # another way than the memory's
+        if way == "memoryless":
             return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
         memory = SurfaceMemory.of(history, force[0].radius)
         misses = sum(isinstance(touch.felt, Missed) for touch in history[-RECENT:])
         gain = min(1.0, force[0].gain, moment[0].gain)
-        aims = Aim.each(memory, grasp)
+        aims = Aim.each(memory, grasp, course.unbalanced)
         aims = aims[min(misses // 2, len(aims) - 1) :][:TRIED]
-        steps = []
+        missing = []
         for aim in aims:
-            steps.append(self._towards(aim, gain, stack, course.ease))
-            if steps[-1].missing < REACHED:
+            missing.append(self._missing(aim, gain, stack))
+            if missing[-1] < REACHED:
                 break
-        step = min(steps, key=lambda step: step.missing)
+        aim = aims[int(np.argmin(missing))]
+        step = self._towards(aim, gain, stack, course.ease)
         solve_us = 1e6 * (time.perf_counter() - begin)
         limit_active = step.shortened or step.solution.limit_active
         gap = None if limit_active else float(np.abs(step.solution.x - step.unlimited).max())
@@ -239,10 +247,16 @@ class HierarchyForm:
                 break
             share /= ratio
         solution = self.hqp.solve(stack.limit_levels(grasp) + aimed + rest)
-        way = aimed[-1]
-        asked = max(float(np.linalg.norm(way.upper)), NEAR)
-        missing = float(np.linalg.norm(way.A @ solution.x - way.upper)) / asked
-        return _Step(solution, unlimited, share < gain, missing)
+        return _Step(solution, unlimited, share < gain)
+
+    def _missing(self, aim: Aim, gain: float, stack: Stack) -> float:
+        """Share of the whole way that limits other than caps keep the hand from."""
+        uncapped = [v.level(aim.grasp) for v in stack.limits if v.priority is not Priority.CAP]
+        motion = aim.predicted(gain)[0].ravel()
+        way = Level.equal(aim.grasp.jacobian, motion, "whole way")
+        x = self.hqp.solve([*uncapped, way]).x
+        left, asked = np.linalg.norm(way.A @ x - motion), np.linalg.norm(motion)
+        return float(left) / max(float(asked), NEAR)
 
     def _back(self, stack: Stack, grasp: Grasp, q: np.ndarray, begin: float) -> Plan:
         """Straight back to q, joint by joint, as far as the caps allow.
@@ -268,7 +282,6 @@ class _Step:
     solution: Solution
     unlimited: np.ndarray  # (n,) [rad] the projection of the same levels, without limits
     shortened: bool
-    missing: float  # [–] share of the way asked for that limits keep from the step
 
 
 def _fingers_lean(stack: Stack, grasp: Grasp) -> bool:

@@ -63,6 +63,12 @@ class Course:
         return cls(stack, history, scores, best, worse, lost or stale >= patience)
 
     @property
+    def unbalanced(self) -> list[Grasp]:
+        """The grasps felt that do not balance."""
+        touches = zip(self.history, self.scores, strict=True)
+        return [t.felt for t, score in touches if isinstance(t.felt, Grasp) and score > 1.0]
+
+    @property
     def ease(self) -> float:
         """Share of the lower laws' step to take: half of it for each balanced grasp it made worse.
 
@@ -74,7 +80,7 @@ class Course:
         hits = [t.felt for t in self.history if isinstance(t.felt, Grasp)]
         radii = np.array([[contact.tip_radius for contact in grasp.contacts] for grasp in hits])
         if np.ptp(radii, axis=0).max() > SAME_ROUNDING:
-            halvings += int((self.scores[np.isfinite(self.scores)] > 1.0).sum()) - 1
+            halvings += len(self.unbalanced) - 1
         return 0.5 ** max(halvings, 0)
 
     def way_back(self, left: int | None) -> np.ndarray | None:

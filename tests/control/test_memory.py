@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 from hqp_grasp.scenarios import irregular
 
-from hqp_grasp.control.aim import Aim
+from hqp_grasp.control.aim import PURSUED, Aim
 from hqp_grasp.control.controller import Controller
+from hqp_grasp.control.forms import REACHED, form_of
 from hqp_grasp.control.memory import SAME_PLACE, SLACK, UNDECIDED, SurfaceMemory, steadied
 from hqp_grasp.control.outline import Outline, directions, wrapped
 from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, PATIENCE, Course
 from hqp_grasp.errors import InputError
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
+from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.history import load_history, save_history
 from hqp_grasp.tasks import ForceTask, MomentTask, stack_of
+from hqp_grasp.tasks.limit import Limit, Priority
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
@@ -138,6 +141,36 @@ def test_corners_sharpen_with_every_touch_of_a_flat_face():
     assert all(later < earlier for earlier, later in itertools.pairwise(turned))
 
 
+def test_a_face_is_taken_to_go_on_beside_an_edge_too():
+    """Of the face two points are felt, then more; beside it the corner at 45°, never its face."""
+    edge = ("corner", 0, 45.0), ("side", 2, 0.0), ("side", 3, 0.0)
+    felt, turned = [], []
+    for y in (-0.03, -0.02, -0.015, -0.01):
+        felt.append(on_square(0.04, 0.0, ("side", 0, y), *edge))
+        turned.append(normal_at(outline_of(*felt), (0.04 + TIP, 0.02))[0])
+    assert all(later < 0.8 * earlier for earlier, later in itertools.pairwise(turned[1:]))
+
+
+def test_a_point_at_the_end_of_a_face_leaves_it_a_face():
+    """The corner beyond the other end sharpens all the same."""
+    beside = ("corner", 3, 90.0), ("corner", 3, 30.0), ("side", 1, 0.0)
+    felt, turned = [], []
+    for y in (-0.035, -0.02, -0.01):
+        felt.append(on_square(0.04, 0.0, ("side", 0, y), *beside))
+        turned.append(normal_at(outline_of(*felt), (0.04 + TIP, 0.036))[0])
+    assert turned[0] > 30.0 > 20.0 > turned[1] > 10.0 > 0.1 > turned[2]
+
+
+def test_the_outline_holds_what_was_felt_of_end_faces():
+    side = on_circle(0.05, -20.0, 0.0, 20.0)
+    contacts = [Contact([-0.03, -0.06, 0.06], UP, tip_radius=TIP), *side.felt.contacts[1:]]
+    end = Touch(side.felt.q, dataclasses.replace(side.felt, contacts=tuple(contacts)))
+    outline = outline_of(side, end)
+    theta, x = outline.at(np.linspace(0.0, outline.length, 200))
+    outside = (directions(theta) * (outline.frame[:, :2] @ [-0.03, -0.06] - x)).sum(axis=1)
+    assert outside.max() < EXACT
+
+
 def test_normals_alike_leave_the_radius_to_the_prior():
     memory = SurfaceMemory.of([on_square(0.04, 0.0, *[("side", 0, y) for y in (-0.01, 0.0, 0.01)])])
     assert (memory.radii > 0.05).all()
@@ -213,7 +246,30 @@ def test_the_axis_is_that_of_the_sides_though_ends_were_felt_often():
     np.testing.assert_allclose(memory.axis(end.felt), UP, atol=10 * UNDECIDED)
 
 
+def test_the_axis_is_that_of_the_sides_though_a_rim_was_felt():
+    """Five contacts that lean by 0.25 beside three on the sides turn it by no more than 2e-3."""
+    side = on_circle(0.05, 0.0, 130.0, 200.0)
+    n = np.array([np.sqrt(1.0 - 0.25**2), 0.0, 0.25])
+    rim = Contact([0.05, 0.0, 0.06], n, tip_radius=TIP)
+    leaning = dataclasses.replace(side.felt, contacts=(rim, *side.felt.contacts[1:]))
+    memory = SurfaceMemory.of([side] + 5 * [Touch(side.felt.q, leaning)])
+    np.testing.assert_allclose(memory.axis(side.felt), UP, atol=2e-3)
+
+
 # --- the form -------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Around(Limit):
+    """A range of its own about a posture."""
+
+    q: np.ndarray
+    room: np.ndarray
+    priority = Priority.RANGE
+
+    def level(self, grasp):
+        x = self.q - grasp.q
+        return Level(np.eye(len(x)), x - self.room, x + self.room, "around")
 
 
 def probed(scene, first, probes, stack=None):
@@ -388,6 +444,41 @@ def test_the_whole_way_leads_to_balance(cylinder, first):
     x = centers - TIP * normals
     moment = np.cross(normals, x - x.mean(axis=0)).sum(axis=0)
     np.testing.assert_allclose(moment, 0.0, atol=1e-3)
+
+
+def test_an_aim_that_many_grasps_went_for_in_vain_seems_farther(cylinder, first):
+    memory = SurfaceMemory.of([Touch(first.q, first)])
+    best = Aim.each(memory, first)
+    i = int(np.argmin([((aim.places - aim.s) ** 2).sum() for aim in best]))  # the nearest
+    few, many = (Aim.each(memory, first, n * [first]) for n in (PURSUED, PURSUED + 100))
+    assert [aim.cost for aim in few] == [aim.cost for aim in best]
+    assert many[-1].cost == best[i].cost and i < len(best) - 1
+
+
+def test_an_aim_out_of_reach_is_passed_over_though_its_first_step_fits(cylinder, first):
+    """Ranges a little wider than the first step, which fits: the rest of the way does not."""
+    form, history = form_of("hierarchy"), [Touch(first.q, first)]
+    stack = Controller(cylinder.articulated, stack_of("fm")).stack
+    memory = SurfaceMemory.of(history)
+    best = Aim.each(memory, first)[0]
+    free = form.plan(stack, first, history)
+    assert free.limit_active  # by its caps
+    tight = stack.within(Around(first.q, 1.05 * np.abs(free.x)))
+    assert form._missing(best, 1.0, stack) < REACHED < form._missing(best, 1.0, tight)
+
+
+def test_a_careful_step_that_misses_is_followed_by_other_ways(cylinder, first):
+    stack = Controller(cylinder.articulated, stack_of("fmk")).stack
+    form, history = form_of("hierarchy"), [Touch(first.q, first)]
+    miss = Touch(first.q, Missed(Miss.NO_TOUCH, "finger_1"))
+    steps = [form.plan(stack, first, history + n * [miss], careful=True).x for n in (0, 2, 4, 6)]
+    paper, memoryless = (
+        form_of(name).plan(stack, first).x for name in ("paper-hierarchy", "memoryless")
+    )
+    np.testing.assert_array_equal(steps[0], paper)
+    assert np.abs(steps[1] - paper).max() > 0.01 < np.abs(steps[1] - memoryless).max()
+    np.testing.assert_array_equal(steps[2], memoryless)
+    np.testing.assert_array_equal(steps[3], paper)
 
 
 def test_a_stored_history_is_continued_bit_for_bit(hexagon, first_on_hexagon, tmp_path):
