@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hqp_grasp.control.outline import Outline
+from hqp_grasp.control.outline import Outline, directions, wrapped
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp, Touch
 
@@ -16,6 +16,7 @@ SLACK = 2e-6  # [m] rounding of what was felt
 SURE = 2.5  # standard errors within which noise explains what was felt
 SAME_PLACE = 1.5e-3  # [m] from one tip's centre to another's, of which noise is averaged out
 LEAST_NOISE = 1e-6  # [rad]
+KNOWN = 5e-5  # [m] to which kinematics know where a tip's centre was
 SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
 UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which tips decide
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
@@ -48,6 +49,9 @@ class SurfaceMemory:
     normals: np.ndarray  # n (N, 3), outward, world
     probes: np.ndarray  # (N,) which touch of the history felt it
     radii: np.ndarray  # R (N,) [m]
+    noise: np.ndarray  # (N,) [rad] standard errors of the normals
+    tip_radii: np.ndarray  # (N,) [m] of what felt them
+    widest: float  # [m] radius of balls that nothing felt bounds
 
     @classmethod
     def of(cls, history: Sequence[Touch], radius: float = 0.05) -> SurfaceMemory:
@@ -61,17 +65,15 @@ class SurfaceMemory:
         x = np.concatenate([grasp.positions for _, grasp in hits])
         n = np.concatenate([grasp.normals for _, grasp in hits])
         probes = np.concatenate([np.full(grasp.k, i) for i, grasp in hits])
-        noise = SURE * np.array([c.noise for _, grasp in hits for c in grasp.contacts])
+        noise = np.array([c.noise for _, grasp in hits for c in grasp.contacts])
         tip = np.array([c.tip_radius for _, grasp in hits for c in grasp.contacts])
-        # How far over the plane of point j noise may lift point k, [j, k] like all these.
-        doubt = noise[:, None] * (np.linalg.norm(x - x[:, None], axis=-1) + tip[:, None])
         beyond = n @ x.T - (n * x).sum(axis=1)[:, None]
-        apart = beyond > CONTRADICTION + doubt
+        apart = beyond > CONTRADICTION + _doubt(x, noise, tip)
         kept = ~((apart | apart.T) & (probes > probes[:, None])).any(axis=1)
-        x, n, noise, doubt = x[kept], n[kept], noise[kept], doubt[np.ix_(kept, kept)]
-        same = 0.5 * (noise[:, None] + noise) ** 2
-        balls = largest_balls(x, n, x, n, WIDEST * radius, SLACK + doubt, SAME_NORMAL + same)
-        return cls(x, n, probes[kept], balls)
+        x, n, noise, tip = x[kept], n[kept], noise[kept], tip[kept]
+        widest = WIDEST * radius
+        balls = _balls(x, n, noise, tip, widest)
+        return cls(x, n, probes[kept], balls, noise, tip, widest)
 
     def axis(self, grasp: Grasp) -> np.ndarray:
         """The direction (3,) along which nothing curves, as far as was felt.
@@ -104,6 +106,13 @@ class SurfaceMemory:
         n = self.normals[across] @ frame.T
         n /= np.linalg.norm(n, axis=1)[:, None]
         felt = np.arctan2(n[:, 1], n[:, 0])
+        if self.noise.any():
+            tip = self.tip_radii[across]
+            c = x + tip[:, None] * n
+            felt, noise = narrowed(c, felt, self.noise[across])
+            n = directions(felt)
+            x = c - tip[:, None] * n
+            R = _balls(x, n, noise, tip, self.widest)
         corners, sharp = _corners(x, n, felt)
         R = np.minimum(R, _beside_edges(x, n, R, felt))
         within = self.positions[~across] @ frame.T  # of end faces and their rims
@@ -141,6 +150,40 @@ def steadied(history: Sequence[Touch]) -> tuple[Touch, ...]:
             touch = replace(touch, felt=replace(touch.felt, contacts=those))
         steady.append(touch)
     return tuple(steady)
+
+
+def narrowed(c: np.ndarray, t: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles t (N,) [rad] of normals felt with noise, within what convexity leaves; their errors.
+
+    A ball's centre c (N, 2) [m], which kinematics tell, moves along a convex curve: all the other
+    centres lie behind the tangent there. So neighbours bound the normal from either side, the
+    closer, the more there are of them.
+    """
+    d = c - c[:, None]
+    far = np.linalg.norm(d, axis=-1)
+    tells = far > KNOWN
+    slack = np.arcsin(KNOWN / np.where(tells, far, KNOWN))
+    bearing = wrapped(np.arctan2(d[..., 1], d[..., 0]) - t[:, None])
+    right, left = tells & (bearing < 0.0), tells & (bearing > 0.0)
+    low = np.where(right, bearing + 0.5 * np.pi - slack, -np.pi).max(axis=1)
+    high = np.where(left, bearing - 0.5 * np.pi + slack, np.pi).min(axis=1)
+    turn = np.where(low > high, 0.5 * (low + high), np.clip(0.0, low, high))
+    left_over = np.maximum(high - low, 0.0) / np.sqrt(12.0)  # of a uniform distribution
+    return wrapped(t + turn), np.minimum(noise, np.maximum(left_over, LEAST_NOISE))
+
+
+def _doubt(x: np.ndarray, noise: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    """How far [m] over the plane of point j noise may lift point k, (N, N) [j, k]."""
+    far = np.linalg.norm(x - x[:, None], axis=-1)
+    return np.asarray(SURE * noise[:, None] * (far + tip[:, None]))
+
+
+def _balls(
+    x: np.ndarray, n: np.ndarray, noise: np.ndarray, tip: np.ndarray, widest: float
+) -> np.ndarray:
+    """Radii (N,) [m] of the largest balls behind all planes, but for what noise may have lifted."""
+    slack, same = SLACK + _doubt(x, noise, tip), 0.5 * SURE**2 * (noise[:, None] + noise) ** 2
+    return largest_balls(x, n, x, n, widest, slack, SAME_NORMAL + same)
 
 
 def largest_balls(

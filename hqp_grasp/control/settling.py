@@ -32,7 +32,8 @@ class Course:
 
     stack: Stack
     history: Sequence[Touch]
-    scores: np.ndarray  # of each touch, inf for misses
+    scores: np.ndarray  # of each touch: errors by what a balanced grasp has at most; inf: a miss
+    nearest: int  # touch that is nearest to balance, where noise counts against a grasp
     best: int  # touch with the best of the balanced grasps, −1: none
     worse: int  # balanced grasps that were worse than the best before
     over: bool  # whether it is time to go back
@@ -41,8 +42,12 @@ class Course:
     def of(cls, stack: Stack, history: Sequence[Touch]) -> Course:
         """Of a history with one grasp at least."""
         hits = [t.felt for t in history if isinstance(t.felt, Grasp)]
-        score = iter(_scores(hits))
-        scores = np.array([next(score) if isinstance(t.felt, Grasp) else np.inf for t in history])
+        felt = [isinstance(touch.felt, Grasp) for touch in history]
+        scores, doubtful = np.full((2, len(history)), np.inf)
+        errors, floor = _errors(hits)
+        goals = np.array([FORCE_GOAL, MOMENT_GOAL])
+        scores[felt] = (errors / np.maximum(goals, BEYOND * floor)).max(axis=1)
+        doubtful[felt] = ((errors + floor) / goals).max(axis=1)
         noise = sum(contact.noise**2 for contact in hits[-1].contacts)  # [rad²] of the angles' sum
         patience = PATIENCE + noise / BETTER**2
         tells = max(BETTER, SURE * np.sqrt(2.0 * noise))
@@ -60,7 +65,9 @@ class Course:
                 lost = True
                 if isinstance(touch.felt, Grasp) and _near(touch.q_target, history[best]):
                     best, stale, lost = -1, 0, False
-        return cls(stack, history, scores, best, worse, lost or stale >= patience)
+        return cls(
+            stack, history, scores, int(doubtful.argmin()), best, worse, lost or stale >= patience
+        )
 
     @property
     def unbalanced(self) -> list[Grasp]:
@@ -93,25 +100,23 @@ class Course:
         if best >= 0 and self.over:
             return self.history[best].felt.q  # type: ignore[union-attr]
         if left is not None:
-            best = best if best >= 0 else int(self.scores.argmin())
+            best = best if best >= 0 else self.nearest
             q: np.ndarray = self.history[best].felt.q  # type: ignore[union-attr]
             last = [t.felt for t in self.history if isinstance(t.felt, Grasp)][-1]
-            if left <= 1.0 + cap_ratio(q - last.q, self.stack, last):
+            # A step further, and it would take one more to return.
+            if left <= 1.0 + np.ceil(cap_ratio(q - last.q, self.stack, last)):
                 return q
         return None
 
 
-def _scores(hits: Sequence[Grasp]) -> np.ndarray:
-    """The larger of ε_f and ε_m in units of what a balanced grasp is felt with, at most."""
-    floor = BEYOND * np.array([grasp.floor for grasp in hits])
+def _errors(hits: Sequence[Grasp]) -> tuple[np.ndarray, np.ndarray]:
+    """ε_f [N²] and ε_m [(N·m)²] of each grasp (h, 2), and what noise makes of them on average."""
     n = np.array([grasp.normals for grasp in hits])
     x = np.array([grasp.positions for grasp in hits])
     f = n.sum(axis=1)
     m = np.cross(n, x - x.mean(axis=1, keepdims=True)).sum(axis=1)
-    return np.maximum(
-        (f * f).sum(axis=1) / np.maximum(FORCE_GOAL, floor[:, 0]),
-        (m * m).sum(axis=1) / np.maximum(MOMENT_GOAL, floor[:, 1]),
-    )
+    errors = np.column_stack([(f * f).sum(axis=1), (m * m).sum(axis=1)])
+    return errors, np.array([grasp.floor for grasp in hits])
 
 
 def _below(stack: Stack, grasp: Grasp) -> float:

@@ -425,13 +425,15 @@ class Robot:
                 f"{self.description.name} touches with {len(points)} points "
                 f"({', '.join(p.name for p in points)}); got {len(contacts)} contacts"
             )
-        places = self._points.copy()
+        places, centers = self._points.copy(), self.centers(q)
         complete = []
         for i, (contact, point) in enumerate(zip(contacts, points, strict=True)):
             radius = float(self.tip_radius[i])
             if radius == 0.0:  # no ball: the touching point, or the centre of curvature there
                 radius = contact.tip_radius
                 places[i] = self.on_link(q, i, contact.position + radius * contact.normal)
+            elif contact.noise > 0.0:  # where a ball is touched, its normal tells best
+                contact = replace(contact, position=centers[i] - radius * contact.normal)
             complete.append(
                 replace(
                     contact,
