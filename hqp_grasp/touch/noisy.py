@@ -14,7 +14,10 @@ from hqp_grasp.world.robot import Robot
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what is felt of a contact, along each axis."""
+    """Standard deviations of what is felt of a contact, along each axis.
+
+    A round tip is touched where its normal says, whatever the place felt: see `Robot.grasp`.
+    """
 
     normal: float = 0.0  # [rad] about the two axes across the normal
     position: float = 0.0  # [m]

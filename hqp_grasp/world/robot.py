@@ -416,7 +416,8 @@ class Robot:
         `contacts` has one Contact for each contact point, in the description's order: position and
         outward normal (world), perhaps wrench, confidence and noise; on a link that is no ball,
         perhaps the `tip_radius` it is rounded by there. Name, link, point and flexion are the
-        robot's, and so are the grasp's Jacobian, Hessian and coupling.
+        robot's, and so are the grasp's Jacobian, Hessian and coupling; and the position too on a
+        ball felt with noise, for joint angles tell its centre.
         """
         q = self.require_q("Robot.grasp: q", q)
         points = self.description.contact_points

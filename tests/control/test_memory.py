@@ -10,7 +10,16 @@ from hqp_grasp.scenarios import irregular
 from hqp_grasp.control.aim import PURSUED, Aim
 from hqp_grasp.control.controller import Controller
 from hqp_grasp.control.forms import REACHED, form_of
-from hqp_grasp.control.memory import SAME_PLACE, SLACK, UNDECIDED, SurfaceMemory, steadied
+from hqp_grasp.control.limits import cap_ratio
+from hqp_grasp.control.memory import (
+    KNOWN,
+    SAME_PLACE,
+    SLACK,
+    UNDECIDED,
+    SurfaceMemory,
+    narrowed,
+    steadied,
+)
 from hqp_grasp.control.outline import Outline, directions, wrapped
 from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, PATIENCE, Course
 from hqp_grasp.errors import InputError
@@ -363,6 +372,52 @@ def test_a_step_that_overshot_is_followed_by_shorter_ones(cylinder, first):
     assert Course.of(stack, history).ease == 1.0
     assert Course.of(stack, [*history, Touch(good.q, worse)]).ease == 0.5
     assert Course.of(stack, [*history, Touch(good.q, worse), Touch(good.q, worse)]).ease == 0.25
+
+
+def test_convexity_bounds_normals_felt_with_noise():
+    """Along a face they become exact between its ends; on a circle they stay what noise allows."""
+    rng, sigma, rho = np.random.default_rng(0), 0.05, 0.008
+    along = np.linspace(-0.02, 0.02, 9)
+    face = np.column_stack([along, np.full(9, 0.03 + rho)])
+    t = 0.5 * np.pi + sigma * rng.standard_normal(9)
+    angle, error = narrowed(face, t, np.full(9, sigma))
+    assert np.abs(angle - 0.5 * np.pi)[1:-1].max() < KNOWN / 0.005 < np.abs(t - 0.5 * np.pi).max()
+    assert error[1:-1].max() < 0.2 * sigma
+    true = np.linspace(-np.pi, np.pi, 40, endpoint=False)
+    circle = (0.05 + rho) * np.column_stack([np.cos(true), np.sin(true)])
+    t = true + sigma * rng.standard_normal(40)
+    angle, error = narrowed(circle, t, np.full(40, sigma))
+    off = np.abs((angle - true + np.pi) % (2.0 * np.pi) - np.pi)
+    between = np.pi / 40 + KNOWN / 0.009  # half the way to the next
+    assert off.max() < between + 1e-3
+    assert error.max() <= sigma
+
+
+def test_the_hand_is_back_in_time_from_where_a_step_more_would_cost_one_more(cylinder, first):
+    stack = Controller(cylinder.articulated, stack_of("fmk"), "hierarchy").stack
+    record = probed(cylinder, first, 3)
+    better, worse = record.grasps[1], record.grasps[0]
+    x = worse.q - better.q
+    x *= 1.5 / cap_ratio(x, stack, better)
+    away = dataclasses.replace(worse, q=better.q + x)
+    history = [Touch(better.q, better), Touch(away.q, away)]
+    ratio = cap_ratio(better.q - away.q, stack, away)
+    assert 1.0 < ratio < 2.0
+    course = Course.of(stack, history)
+    assert course.way_back(4) is None
+    np.testing.assert_array_equal(course.way_back(3), better.q)
+
+
+def test_noise_counts_against_a_grasp_that_is_to_be_returned_to(cylinder, first):
+    """One felt once by a lucky touch is not better than one that is nearly as good for sure."""
+    stack = stack_of("fmk")
+    felt = probed(cylinder, first, 3).grasps[1]
+    lucky = [dataclasses.replace(c, noise=0.2) for c in felt.contacts]
+    n = felt.contacts[0].normal + 1e-3
+    sure = (dataclasses.replace(felt.contacts[0], normal=n / np.linalg.norm(n)), *felt.contacts[1:])
+    grasps = [dataclasses.replace(felt, contacts=tuple(v)) for v in (lucky, sure)]
+    course = Course.of(stack, [Touch(g.q, g) for g in grasps])
+    assert course.scores[0] < course.scores[1] and course.nearest == 1
 
 
 def test_tips_that_are_no_balls_take_shorter_steps_until_they_balance(cylinder, first):

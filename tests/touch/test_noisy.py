@@ -26,15 +26,24 @@ def test_errors_have_the_spread_that_was_asked_for(scene, began):
     noise, rng = hg.Noise(normal=0.02, position=5e-4), np.random.default_rng(1)
     probe = NoisyProbe(hg.GeometricProbe(scene), scene.articulated, noise, rng)
     angles, ways = [], []
-    for _ in range(200):
-        felt = probe.touch(began.q)
-        for contact, true in zip(felt.contacts, probe.felt[-1].contacts, strict=True):
-            angles.append(contact.normal - (contact.normal @ true.normal) * true.normal)
-            ways.append(contact.position - true.position)
+    for true in began.contacts * 200:
+        contact = probe._felt(true)
+        angles.append(contact.normal - (contact.normal @ true.normal) * true.normal)
+        ways.append(contact.position - true.position)
     square = (np.array(angles) ** 2).sum(axis=1).mean()
     assert np.sqrt(square / 2) == pytest.approx(0.02, rel=0.1)  # 600 errors about two axes
     np.testing.assert_allclose(np.std(ways, axis=0), 5e-4, rtol=0.15)
     np.testing.assert_allclose(np.mean(ways, axis=0), 0.0, atol=1e-4)
+
+
+def test_a_ball_felt_with_noise_is_touched_where_its_normal_says(scene, began):
+    """Kinematics know the ball's centre better than touch knows the place."""
+    rng = np.random.default_rng(1)
+    probe = NoisyProbe(hg.GeometricProbe(scene), scene.articulated, hg.Noise(0.02, 5e-4), rng)
+    felt, centers = probe.touch(began.q), scene.articulated.centers(began.q)
+    for contact, center in zip(felt.contacts, centers, strict=True):
+        place = center - contact.tip_radius * contact.normal
+        np.testing.assert_allclose(contact.position, place, atol=1e-6)
 
 
 def test_without_noise_what_is_felt_is_what_is(scene):
