@@ -91,7 +91,8 @@ class Truth:
 class SimulatedHand:
     """`Driver` of a robot's position servos in a scene, in MuJoCo's full dynamics.
 
-    With links="pass" only tips meet the object. `rng` draws the imperfections.
+    With links="pass" only tips meet the object. `rng` draws the imperfections. Joints that move no
+    contact point, such as those of another arm, stand at home, braked.
 
     Phases run in single calls of the simulator, whose readings are searched afterwards: where
     something happened, the simulation returns to that step and goes on from there. So the loop
@@ -128,10 +129,9 @@ class SimulatedHand:
         self._at = np.array([model.joint(names[j]).qposadr[0] for j in self._all])
         self._driven = np.flatnonzero(~robot.idle)
         driven = tuple(robot.joints[j] for j in self._driven)
-        # States end with the joints that stand, and their speed.
-        size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        # A state is MuJoCo's, then the joints that stand braked, then their speed.
+        self._size = size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._standing = np.append(robot.home[robot.idle], 0.0)
-        self._size = size
         self._q, self._v = np.zeros(n, dtype=int), np.full(n, size + len(self._standing) - 1)
         self._q[robot.idle] = size + np.arange(robot.idle.sum())
         self._q[self._driven] = [1 + model.joint(j).qposadr[0] for j in driven]
@@ -139,8 +139,9 @@ class SimulatedHand:
         self._servo = _servos(model, driven)
         self._kp, self._lag = np.ones(n), np.zeros(n)
         self._kp[self._driven] = kp = model.actuator_gainprm[self._servo, 0]
-        # [s] a servo stays behind its target, by speed
-        self._lag[self._driven] = -model.actuator_biasprm[self._servo, 2] / kp
+        self._lag[self._driven] = (
+            -model.actuator_biasprm[self._servo, 2] / kp
+        )  # [s] behind a target
         points = robot.description.contact_points
         self._tips = [model.geom(name).id for name in _round_tips(robot)]
         self._sites = [model.site(p.site).id for p in points]
@@ -701,12 +702,12 @@ def _model(scene: Scene, physics: Physics, links: str) -> mujoco.MjModel:
 
 def _brake(spec: mujoco.MjSpec, robot: Robot) -> None:
     """Fix at home the joints that move no contact point, as those of another arm."""
+    if not robot.idle.any():
+        return
     model, data = robot.model, mujoco.MjData(robot.model)
     robot.place(data, robot.home)
     fixed = np.flatnonzero(~robot.coupling[:, ~robot.idle].any(axis=1))
-    names = {model.joint(int(j)).name for j in fixed}
-    if not robot.idle.any():
-        return
+    names = {model.joint(j).name for j in fixed.tolist()}
     for link in spec.bodies:
         joints = [joint for joint in link.joints if joint.name in names]
         if not joints:
