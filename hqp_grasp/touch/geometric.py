@@ -88,9 +88,11 @@ class GeometricProbe:
 
     @property
     def _data(self) -> mujoco.MjData:
-        if not hasattr(self._local, "data"):
-            self._local.data = mujoco.MjData(self.scene.model)
-        return self._local.data
+        try:
+            data: mujoco.MjData = self._local.data
+        except AttributeError:
+            data = self._local.data = mujoco.MjData(self.scene.model)
+        return data
 
     def touch(self, q_target: np.ndarray) -> Grasp | Missed:
         """Move to q_target (n,) [rad], close every finger, and return the grasp felt there."""
