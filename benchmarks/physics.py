@@ -169,7 +169,7 @@ def figure5(
     probes: int = 25,
     seed: int = 102,
     robot: str = "umass_torso",
-    timestep: float = 0.002,
+    timestep: float = 0.004,
     plot: Path = Path("out/figure5.png"),
 ) -> None:
     """The paper's experiment on the physical robot: 20 trials of 25 probes, with noise."""
@@ -219,8 +219,8 @@ def draw_figure5(sets: dict[str, list[Outcome]], path: Path) -> None:
     for axis, label in zip(axes, ("true ε_f [N²]", "true √ε_m [mm·N]"), strict=False):
         axis.set(yscale="log", xlabel="probe", ylabel=label)
     axes[2].set(xlabel="adduction [°]", ylabel="elevation [°]")
-    for axis in axes:
-        axis.legend()
+    for axis, place in zip(axes, ("upper right", "upper right", "center right"), strict=True):
+        axis.legend(loc=place)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
