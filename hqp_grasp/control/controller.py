@@ -29,6 +29,10 @@ IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE)  # what the palm withdraws from
 BROKEN = (Miss.SENSOR, Miss.STUCK)  # no fault of the step, and it may pass
 PASSING = (*BROKEN, Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR)  # what the first touch tries again
 MAX_BROKEN = 4  # touches from one grasp that this may cost
+AROUND = (0, 180, 90, 270, 45, 225, 135, 315)  # [°] about the vertical, tried in turn,
+SEARCH = 0.02  # [m] beside a first touch that found nothing
+SEARCH_STEPS = 3  # of Newton's method, to get there
+SEARCH_RANK = 1e-3  # [–] of the palm's Jacobian, below which an arm cannot go there
 CLIP_TOLERANCE = 1e-9  # [rad] a solver's rounding may leave a range by; more is a bug
 
 
@@ -79,7 +83,8 @@ class Controller:
     the next step, by RETREAT more at each such miss. Where a sensor was silent, or the hand did not
     open, the same step is tried again. When nothing is left to try, "hierarchy" begins again from
     its first grasp, with careful steps. Where that brings no touch either, and for the other forms
-    at once, or when the `budget` of touches is spent, the controller gives up.
+    at once, or when the `budget` of touches is spent, the controller gives up. Where the very first
+    touch finds nothing, the palm is sent SEARCH beside there, level, all around.
     """
 
     robot: Robot
@@ -118,12 +123,10 @@ class Controller:
         """
         stand = self._stand(history)
         grasp, misses = stand.grasp, stand.misses
-        if grasp is None and misses[-1].reason in PASSING and len(misses) < MAX_BROKEN:
-            return Step(history[0].q_target, reason="the same again")
-        if grasp is None:
-            return Step(None, reason="no touch has felt a grasp yet: begin where the hand touches")
         if self.budget is not None and len(history) >= self.budget:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
+        if grasp is None:
+            return self._search(history[0].q_target, misses)
         if self._spent(misses):
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
@@ -150,6 +153,21 @@ class Controller:
         }
         reason = ", ".join(what for what, done in reactions.items() if done)
         return Step(self._clipped(grasp, x), stand.way, plan, self._shares[short], reason)
+
+    def _search(self, q: np.ndarray, misses: Sequence[Missed]) -> Step:
+        """The first touch, sent to q (n,) [rad], again; beside there once it found nothing."""
+        if misses[-1].reason in PASSING and len(misses) < MAX_BROKEN:
+            return Step(q, reason="the same again")
+        tried = sum(missed.reason not in PASSING for missed in misses)
+        if not 0 < tried <= len(AROUND) or not self.robot.arm:
+            return Step(None, reason="no touch has felt a grasp: begin where the hand touches")
+        angle = np.radians(AROUND[tried - 1])
+        goal = self.robot.palm(q)[0] + SEARCH * np.array([np.cos(angle), np.sin(angle), 0.0])
+        for _ in range(SEARCH_STEPS):
+            way = np.append(goal - self.robot.palm(q)[0], np.zeros(3))
+            q = q + np.linalg.pinv(self.robot.palm_jacobian(q), rcond=SEARCH_RANK) @ way
+            q = np.clip(q, self.robot.q_lower, self.robot.q_upper)
+        return Step(q, reason=f"{1e3 * SEARCH:g} mm beside")
 
     @property
     def _shares(self) -> tuple[float, ...]:

@@ -164,9 +164,33 @@ def test_the_first_touch_is_tried_again_where_what_ails_it_may_pass(robot, stack
     if reason in (Miss.SENSOR, Miss.STUCK, Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR):
         np.testing.assert_array_equal(step.q_target, first.q)
         assert step.reason == "the same again"
-        assert controller.step([missed] * 4).q_target is None
     else:
-        assert step.q_target is None
+        assert step.reason == "20 mm beside"
+
+
+def test_where_the_first_touch_finds_nothing_it_is_tried_beside_all_around(robot, stack, first):
+    """The palm moves level and keeps its direction; fingers, and the object's place, stay."""
+    controller, history = Controller(robot, stack), [Touch(first.q, MISSED)]
+    p, R = robot.palm(first.q)
+    ways = []
+    while (step := controller.step(history)).q_target is not None:
+        place, turned = robot.palm(step.q_target)
+        np.testing.assert_allclose(turned, R, atol=0.02)
+        assert robot.violation(step.q_target) == 0.0
+        ways.append(place - p)
+        history.append(Touch(step.q_target, MISSED))
+    assert "begin where the hand touches" in step.reason
+    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), 0.02, atol=1e-4)
+    np.testing.assert_allclose(np.array(ways)[:, 2], 0.0, atol=1e-4)
+    angles = np.sort(np.degrees(np.arctan2(*np.array(ways)[:, 1::-1].T)) % 360.0)
+    np.testing.assert_allclose(np.diff(angles), 45.0, atol=1.0)
+
+
+def test_a_hand_that_nothing_carries_does_not_search(first):
+    robot = Scene(robot="bhand").articulated
+    q = robot.home
+    step = Controller(robot, stack_of("fmk")).step([Touch(q, MISSED)])
+    assert step.q_target is None and "begin where the hand touches" in step.reason
 
 
 def test_a_sensor_that_comes_back_costs_no_share_of_the_step(robot, stack, first):
@@ -187,11 +211,6 @@ def test_a_spent_budget_ends_the_run(robot, stack, first):
     assert controller.step(history).q_target is not None
     spent = controller.step(history * 2)
     assert spent.q_target is None and spent.reason == "the budget of 2 touches is spent"
-
-
-def test_misses_alone_are_no_ground_for_a_step(robot, stack, first):
-    step = Controller(robot, stack).step([Touch(first.q, MISSED)])
-    assert step.q_target is None and "begin where the hand touches" in step.reason
 
 
 def test_caps_stay_when_another_limit_is_named(robot, first):
