@@ -169,7 +169,9 @@ def narrowed(c: np.ndarray, t: np.ndarray, noise: np.ndarray) -> tuple[np.ndarra
     high = np.where(left, bearing - 0.5 * np.pi + slack, np.pi).min(axis=1)
     turn = np.where(low > high, 0.5 * (low + high), np.clip(0.0, low, high))
     left_over = np.maximum(high - low, 0.0) / np.sqrt(12.0)  # of a uniform distribution
-    return wrapped(t + turn), np.minimum(noise, np.maximum(left_over, LEAST_NOISE))
+    explained = np.abs(turn) <= SURE * noise  # else it is kinematics that err
+    error = np.where(explained, np.minimum(noise, np.maximum(left_over, LEAST_NOISE)), noise)
+    return wrapped(t + np.where(explained, turn, 0.0)), error
 
 
 def _doubt(x: np.ndarray, noise: np.ndarray, tip: np.ndarray) -> np.ndarray:
