@@ -158,6 +158,7 @@ def narrowed(c: np.ndarray, t: np.ndarray, noise: np.ndarray) -> tuple[np.ndarra
     A ball's centre c (N, 2) [m], which kinematics tell, moves along a convex curve: all the other
     centres lie behind the tangent there. So neighbours bound the normal from either side, the
     closer, the more there are of them.
+    What noise does not explain is left as it is felt.
     """
     d = c - c[:, None]
     far = np.linalg.norm(d, axis=-1)
