@@ -15,7 +15,7 @@ FORCE_GOAL = 1e-3  # [N²] ε_f of a balanced grasp, at most
 MOMENT_GOAL = (2e-3) ** 2  # [(N·m)²] ε_m of one, at most
 BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
 BETTER = 2e-3  # by which the lower laws' errors fall, or the grasp is no better
-SURE = 2.0  # standard errors that tell two values apart
+TELLING = 2.0  # standard errors that tell two values apart
 PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
 SAME_ROUNDING = 1e-6  # [m] radii of one tip differ by, as long as it is a ball
@@ -50,7 +50,7 @@ class Course:
         doubtful[felt] = ((errors + floor) / goals).max(axis=1)
         noise = sum(contact.noise**2 for contact in hits[-1].contacts)  # [rad²] of the angles' sum
         patience = PATIENCE + noise / BETTER**2
-        tells = max(BETTER, SURE * np.sqrt(2.0 * noise))
+        tells = max(BETTER, TELLING * np.sqrt(2.0 * noise))
         best, least, stale, lost, worse = -1, np.inf, 0, False, 0
         for i, touch in enumerate(history):
             if scores[i] <= 1.0:
