@@ -36,13 +36,15 @@ class Aim:
 
     @classmethod
     def each(cls, memory: SurfaceMemory, grasp: Grasp, vain: Sequence[Grasp] = ()) -> list[Aim]:
-        """Aims that differ, the best first.
+        """Aims that differ, the best first; none where every normal leans along the axis.
 
         `vain` are grasps that did not balance. The aim nearest to each of them is taken to have
         been pursued, and seems the farther, the more of them there are: another has its turn.
         """
         rho = _tip_radii(grasp)
         a = memory.axis(grasp)
+        if not (np.abs(memory.normals @ a) < LEANING).any():
+            return []
         outline = memory.outline(a, float(rho.mean()))
         s = outline.locate((grasp.positions + rho[:, None] * grasp.normals) @ outline.frame.T)
         cost, places = outline.balanced(s)

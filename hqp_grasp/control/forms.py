@@ -222,6 +222,8 @@ class HierarchyForm:
         misses = sum(isinstance(touch.felt, Missed) for touch in history[-RECENT:])
         gain = min(1.0, force[0].gain, moment[0].gain)
         aims = Aim.each(memory, grasp, course.unbalanced)
+        if not aims:
+            return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
         aims = aims[min(misses // 2, len(aims) - 1) :][:TRIED]
         missing = []
         for aim in aims:

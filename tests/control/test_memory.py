@@ -374,6 +374,13 @@ def test_a_step_that_overshot_is_followed_by_shorter_ones(cylinder, first):
     assert Course.of(stack, [*history, Touch(good.q, worse), Touch(good.q, worse)]).ease == 0.25
 
 
+def test_normals_that_all_lean_give_no_aim():
+    """As at the corner of a box: along no direction does the surface felt keep its shape."""
+    contacts = [Contact(0.05 * n, n, tip_radius=TIP) for n in np.eye(3)]
+    grasp = Grasp(np.zeros(2), tuple(contacts), np.zeros((9, 2)))
+    assert Aim.each(SurfaceMemory.of([Touch(grasp.q, grasp)]), grasp) == []
+
+
 def test_convexity_bounds_normals_felt_with_noise():
     """Along a face they become exact between its ends; on a circle they stay what noise allows."""
     rng, sigma, rho = np.random.default_rng(0), 0.05, 0.008
