@@ -166,8 +166,16 @@ class Controller:
         for _ in range(SEARCH_STEPS):
             way = np.append(goal - self.robot.palm(q)[0], np.zeros(3))
             q = q + np.linalg.pinv(self.robot.palm_jacobian(q), rcond=SEARCH_RANK) @ way
-            q = np.clip(q, self.robot.q_lower, self.robot.q_upper)
+            q = np.clip(q, *self._ranges)
         return Step(q, reason=f"{1e3 * SEARCH:g} mm beside")
+
+    @property
+    def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
+        """The joints' ranges (n,) [rad], lower and upper, the narrowest of all limits."""
+        limits = self.stack.limits  # type: ignore[union-attr]
+        robots = [self.robot, *(v.robot for v in limits if isinstance(v, ConfigurationLimit))]
+        lower = np.max([robot.q_lower for robot in robots], axis=0)
+        return lower, np.min([robot.q_upper for robot in robots], axis=0)
 
     @property
     def _shares(self) -> tuple[float, ...]:
@@ -216,10 +224,7 @@ class Controller:
     def _clipped(self, grasp: Grasp, x: np.ndarray) -> np.ndarray:
         """q + x within the ranges, as the very last act: only rounding may be cut."""
         q = grasp.q + x
-        limits = self.stack.limits  # type: ignore[union-attr]
-        ranges = [v.robot for v in limits if isinstance(v, ConfigurationLimit)]
-        lower = np.max([self.robot.q_lower, *(r.q_lower for r in ranges)], axis=0)
-        upper = np.min([self.robot.q_upper, *(r.q_upper for r in ranges)], axis=0)
+        lower, upper = self._ranges
         clipped = np.clip(q, lower, upper)
         left = np.abs(clipped - q) > CLIP_TOLERANCE
         started_inside = (grasp.q >= lower) & (grasp.q <= upper)

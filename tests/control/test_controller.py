@@ -1,5 +1,6 @@
 """The controller by itself: a pure function of what was felt, without scene or probe."""
 
+import copy
 import dataclasses
 import itertools
 
@@ -184,6 +185,17 @@ def test_where_the_first_touch_finds_nothing_it_is_tried_beside_all_around(robot
     np.testing.assert_allclose(np.array(ways)[:, 2], 0.0, atol=1e-4)
     angles = np.sort(np.degrees(np.arctan2(*np.array(ways)[:, 1::-1].T)) % 360.0)
     np.testing.assert_allclose(np.diff(angles), 45.0, atol=1.0)
+
+
+def test_a_search_keeps_to_ranges_narrower_than_the_robots(robot, stack, first):
+    narrow = copy.copy(robot)
+    for name, room in (("q_lower", -0.01), ("q_upper", 0.01)):
+        object.__setattr__(narrow, name, first.q + room)
+    missed = Touch(first.q, MISSED)
+    step = Controller(robot, stack.within(ConfigurationLimit(narrow))).step([missed])
+    free = Controller(robot, stack).step([missed])
+    assert np.abs(step.q_target - first.q).max() <= 0.01 + 1e-12
+    assert np.abs(free.q_target - first.q).max() > 0.02
 
 
 def test_a_hand_that_nothing_carries_does_not_search(first):
