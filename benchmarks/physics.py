@@ -27,7 +27,7 @@ import hqp_grasp as hg
 from hqp_grasp.control.settling import BEYOND
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 from hqp_grasp.experiments.start import FirstTouch
-from hqp_grasp.touch.imperfections import FAULTS, Fault
+from hqp_grasp.world.imperfections import FAULTS, Fault
 
 OBJECTS = {
     "cylinder": hg.Cylinder(radius=0.05),

@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 
 import hqp_grasp as hg
 from hqp_grasp.touch.physical import payload, weight
-from hqp_grasp.touch.simulated import CONTACTS
+from hqp_grasp.world.physics import CONTACTS
 
 FRICTIONS = (0.4, 0.8)
 WANTED = (0.02, 0.1)  # [mm], [°] on stiff contacts

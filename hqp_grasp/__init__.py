@@ -39,14 +39,15 @@ from hqp_grasp.tasks import (
 )
 from hqp_grasp.touch.driver import Driver, DriverLimits, Readings
 from hqp_grasp.touch.geometric import GeometricProbe
-from hqp_grasp.touch.imperfections import Imperfections
 from hqp_grasp.touch.noisy import Noise
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.touch.sensing import sense
-from hqp_grasp.touch.simulated import Physics, SimulatedHand
+from hqp_grasp.touch.simulated import SimulatedHand
 from hqp_grasp.world.description import RobotDescription
+from hqp_grasp.world.imperfections import Imperfections
 from hqp_grasp.world.objects import Body, Cylinder, Prism
+from hqp_grasp.world.physics import Physics
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 

@@ -24,11 +24,12 @@ from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Stack, Task
 from hqp_grasp.touch.geometric import GeometricProbe
-from hqp_grasp.touch.imperfections import Imperfections
 from hqp_grasp.touch.noisy import Noise, NoisyProbe
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.probe import Probe
-from hqp_grasp.touch.simulated import Physics, SimulatedHand
+from hqp_grasp.touch.simulated import SimulatedHand
+from hqp_grasp.world.imperfections import Imperfections
+from hqp_grasp.world.physics import Physics
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 

@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from hqp_grasp.errors import InputError, ModelError, one_of, positive
+from hqp_grasp.errors import InputError, one_of, positive
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.touch.driver import DriverLimits, Readings
 from hqp_grasp.touch.geometric import OVERLAP, RETREAT
-from hqp_grasp.touch.imperfections import Imperfections, SensorErrors
+from hqp_grasp.world.imperfections import SensorErrors
 from hqp_grasp.world.objects import OBJECT
-from hqp_grasp.world.robot import Robot
+from hqp_grasp.world.physics import Physics, foot, round_tips, servos, simulated_model
 from hqp_grasp.world.scene import Scene
 
-# How a contact yields: solref and solimp of the object's geom.
-CONTACTS = {
-    "stiff": ((0.005, 1.0), (0.99, 0.999, 0.001, 0.5, 2.0)),
-    "medium": ((0.01, 1.0), (0.95, 0.99, 0.001, 0.5, 2.0)),
-    "default": ((0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)),  # MuJoCo's
-}
-SUPPORTS = ("fixed", "pedestal", "table")
-SPIN_FRICTION = 0.02  # [m] torque about the normal that a contact transmits, by normal force
 SAMPLING = 0.01  # [s] between readings
 ZEROING = 0.05  # [s] of samples, from whose median closing counts the change of force
 PEAK = 1.875  # a minimum-jerk ramp's fastest speed, by its mean
@@ -46,33 +38,6 @@ STARTLE = 1.0  # [N] more than at its beginning, a move in free air stops: a bum
 PRESS = 0.4  # share of the force limit that is held, at most
 MOVING, REACTING = 0.4, 0.05  # [s] in one call of the simulator, and while fingers press
 IDLE, CLOSING, HOLDING = 0, 1, 2
-
-
-@dataclass(frozen=True)
-class Physics:
-    """The world in which a simulated hand touches.
-
-    `contact` says how the object yields, one of CONTACTS. `support` holds it: "fixed"; free on a
-    "pedestal" narrower than itself; free on a "table".
-    """
-
-    contact: str = "medium"
-    support: str = "fixed"
-    mass: float = 0.1  # [kg] of a free object
-    friction: float = 0.6  # of the object
-    timestep: float = 0.002  # [s]
-    imperfections: Imperfections = field(default_factory=Imperfections)
-
-    def __post_init__(self) -> None:
-        one_of("contact", self.contact, CONTACTS)
-        one_of("support", self.support, SUPPORTS)
-        for name in ("mass", "friction", "timestep"):
-            positive(f"Physics.{name}", getattr(self, name))
-        if not isinstance(self.imperfections, Imperfections):
-            raise InputError(
-                "Physics.imperfections must be Imperfections, such as "
-                f'Imperfections.preset("loadcell"); got {self.imperfections!r}'
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +80,8 @@ class SimulatedHand:
         k, n = len(self.robot.flexion), self.robot.n
         self._flexion = np.array([_only(point) for point in self.robot.flexion])
         self._free = physics.support != "fixed"
-        self.table = _foot(scene)[0] if physics.support == "table" else None  # [m] its height
-        self.model = _model(scene, physics, links)
+        self.table = foot(scene)[0] if physics.support == "table" else None  # [m] its height
+        self.model = simulated_model(scene, physics, links)
         self._data = mujoco.MjData(self.model)
         self._rollout = Rollout(nthread=0)
         self._dt = timestep
@@ -136,14 +101,14 @@ class SimulatedHand:
         self._q[robot.idle] = size + np.arange(robot.idle.sum())
         self._q[self._driven] = [1 + model.joint(j).qposadr[0] for j in driven]
         self._v[self._driven] = [1 + model.nq + model.joint(j).dofadr[0] for j in driven]
-        self._servo = _servos(model, driven)
+        self._servo = servos(model, driven)
         self._kp, self._lag = np.ones(n), np.zeros(n)
         self._kp[self._driven] = kp = model.actuator_gainprm[self._servo, 0]
         self._lag[self._driven] = (
             -model.actuator_biasprm[self._servo, 2] / kp
         )  # [s] behind a target
         points = robot.description.contact_points
-        self._tips = [model.geom(name).id for name in _round_tips(robot)]
+        self._tips = [model.geom(name).id for name in round_tips(robot)]
         self._sites = [model.site(p.site).id for p in points]
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         thing = model.geom_bodyid == model.body(OBJECT).id
@@ -157,7 +122,7 @@ class SimulatedHand:
         self._wrench = slice(first, first + 6 * k)
         first = model.sensor(f"{driven[0]} torque").adr[0]
         self._torque = slice(first, first + len(driven))
-        torque = robot.model.actuator_forcerange[_servos(robot.model, robot.joints), 1]
+        torque = robot.model.actuator_forcerange[servos(robot.model, robot.joints), 1]
         self.limits = DriverLimits(
             robot.q_lower, robot.q_upper, robot.velocity, torque, force_limit, watchdog
         )
@@ -606,139 +571,3 @@ def _only(flexion: tuple[int, ...]) -> int:
             f"a finger has {len(flexion)} flexion joints; the simulated hand closes one a finger"
         )
     return flexion[0]
-
-
-def _round_tips(robot: Robot) -> list[str]:
-    """The geom of each tip, by name."""
-    for point, radius in zip(robot.description.contact_points, robot.tip_radius, strict=True):
-        if radius == 0.0 or not point.site:
-            raise InputError(
-                f"the simulated hand feels with round tips that have a site at their centre; "
-                f"{point.name} of {robot.description.name} has none"
-            )
-    return [robot.model.geom(geoms[0]).name for geoms in robot.geoms]
-
-
-def _servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> np.ndarray:
-    """The actuator (n,) of each joint."""
-    found = []
-    for name in joints:
-        drives = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (
-            model.actuator_trnid[:, 0] == model.joint(name).id
-        )
-        affine = model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        (servo,) = np.nonzero(drives & affine & (model.actuator_forcelimited != 0))
-        if len(servo) != 1:
-            raise ModelError(
-                f"joint {name!r} needs one position actuator with a forcerange; it has {len(servo)}"
-            )
-        found.append(int(servo[0]))
-    return np.array(found)
-
-
-def _model(scene: Scene, physics: Physics, links: str) -> mujoco.MjModel:
-    """Robot, object and what it stands on, with sensors at the tips and servos."""
-    spec, robot = scene.spec(), scene.articulated
-    spec.option.timestep = physics.timestep
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
-    bodies = {body.name: body for body in spec.bodies}
-    thing = bodies.pop(OBJECT)
-    bodies.pop("world")
-    for body in bodies.values():
-        body.gravcomp = 1.0 + physics.imperfections.gravity_error
-    for geom in thing.geoms:
-        # The object decides how a contact is: else its friction would be the larger of both geoms'.
-        geom.priority, geom.condim = 1, 4
-        geom.solref, geom.solimp = CONTACTS[physics.contact]
-        geom.friction = (physics.friction, SPIN_FRICTION, 1e-4)
-        if not (geom.contype or geom.conaffinity):
-            geom.mass = 0.0  # drawn, not felt
-    if physics.support != "fixed":
-        thing.add_freejoint(name=OBJECT)
-        bottom, width = _foot(scene)
-        if physics.support == "pedestal":
-            half = max(0.02, bottom / 2.0)
-            size, kind = [0.5 * width, half, 0.0], mujoco.mjtGeom.mjGEOM_CYLINDER
-        else:
-            half, kind = 0.02, mujoco.mjtGeom.mjGEOM_BOX
-            size = [0.3, 0.3, half]
-        x, y = np.array(scene.position)[:2]
-        spec.worldbody.add_geom(name="support", type=kind, size=size, pos=[x, y, bottom - half])
-    if links == "pass":
-        tips = {robot.model.geom(name).bodyid[0] for name in _round_tips(robot)}
-        for name in bodies:
-            if robot.model.body(name).id not in tips:
-                spec.add_exclude(bodyname1=name, bodyname2=OBJECT)
-    for point in robot.description.contact_points:
-        for kind, word in (
-            (mujoco.mjtSensor.mjSENS_FORCE, "force"),
-            (mujoco.mjtSensor.mjSENS_TORQUE, "torque"),
-        ):
-            spec.add_sensor(
-                name=f"{point.name} touch {word}",
-                type=kind,
-                objtype=mujoco.mjtObj.mjOBJ_SITE,
-                objname=point.site,
-            )
-    _brake(spec, robot)
-    for joint in np.array(robot.joints)[~robot.idle].tolist():
-        spec.add_sensor(
-            name=f"{joint} torque",
-            type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
-            objtype=mujoco.mjtObj.mjOBJ_JOINT,
-            objname=joint,
-        )
-    model = spec.compile()
-    if physics.support != "fixed":
-        body = model.body(OBJECT).id
-        share = physics.mass / model.body_mass[body]
-        model.body_mass[body] *= share
-        model.body_inertia[body] *= share
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
-
-
-def _brake(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Fix at home the joints that move no contact point, as those of another arm."""
-    if not robot.idle.any():
-        return
-    model, data = robot.model, mujoco.MjData(robot.model)
-    robot.place(data, robot.home)
-    fixed = np.flatnonzero(~robot.coupling[:, ~robot.idle].any(axis=1))
-    names = {model.joint(j).name for j in fixed.tolist()}
-    for link in spec.bodies:
-        joints = [joint for joint in link.joints if joint.name in names]
-        if not joints:
-            continue
-        body = model.body(link.name).id
-        parent = int(model.body_parentid[body])
-        back, away = np.zeros(4), data.xpos[body] - data.xpos[parent]
-        mujoco.mju_negQuat(back, data.xquat[parent])
-        mujoco.mju_rotVecQuat(link.pos, away, back)
-        mujoco.mju_mulQuat(link.quat, back, data.xquat[body])
-        link.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-        for joint in joints:
-            spec.delete(joint)
-    for equality in list(spec.equalities):
-        if {equality.name1, equality.name2} & names:
-            spec.delete(equality)
-    for actuator in list(spec.actuators):
-        if actuator.target in names:
-            spec.delete(actuator)
-
-
-def _foot(scene: Scene) -> tuple[float, float]:
-    """Height of the object's lowest point [m], and half its narrowest horizontal width [m]."""
-    model, robot = scene.model, scene.articulated
-    data = mujoco.MjData(model)
-    robot.place(data, robot.home)
-    lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
-    for geom in np.flatnonzero(model.geom_bodyid == model.body(OBJECT).id):
-        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
-            middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-            R = data.geom_xmat[geom].reshape(3, 3)
-            center, reach = data.geom_xpos[geom] + R @ middle, np.abs(R) @ half
-            lower, upper = np.minimum(lower, center - reach), np.maximum(upper, center + reach)
-    return float(lower[2]), float((upper - lower)[:2].min() / 2.0)
