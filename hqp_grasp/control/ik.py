@@ -8,7 +8,7 @@ import mink
 import numpy as np
 from mink.tasks import BaseTask
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, number
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks.limit import Priority
@@ -36,14 +36,15 @@ def solve_ik(
     as the levels above allow. HQP(solver).solve(ik_levels(…)) tells which, and by how much.
     The compiled search answers unless another solver is named: it is the fastest, and exact.
 
-    Raises InputError for malformed arguments, and with `safety_break`, as mink does,
-    mink.NotWithinConfigurationLimits for a start outside the joint ranges.
+    Raises InputError for malformed arguments, SolverError where no answer is certified, and with
+    `safety_break`, as mink does, mink.NotWithinConfigurationLimits for a start outside the joint
+    ranges.
     """
     if safety_break:
         configuration.check_limits(safety_break=True)
     hqp = HQP(solver)
     levels = ik_levels(configuration, priorities, dt, damping, limits, constraints, hqp)
-    return hqp.solve(levels).x / dt
+    return hqp.solve(levels).certified_x / float(dt)
 
 
 def ik_levels(
@@ -65,9 +66,10 @@ def ik_levels(
     μ > 0, `hqp` first solves the damped priority under the levels above, and the level asks for
     the W Δq found. A task with a dense Hessian H and slope c gives the rows √H Δq = −√H⁺ c.
     """
-    if not (np.isfinite(dt) and dt > 0.0):
+    dt, damping = number("dt", dt), number("damping", damping)
+    if not 0.0 < dt < np.inf:
         raise InputError(f"dt must be a time above 0 s; got {dt}")
-    if not (np.isfinite(damping) and damping >= 0.0):
+    if not 0.0 <= damping < np.inf:
         raise InputError(f"damping must be at least 0; got {damping}")
     nv = configuration.nv
     if limits is None:

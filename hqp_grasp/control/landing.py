@@ -16,7 +16,10 @@ LANDING_DAMPING = 1e-2  # [m/rad] tips that move less than this with the joints 
 
 
 def land(robot: Robot, stack: Stack, grasp: Grasp, x: np.ndarray) -> np.ndarray:
-    """Correct x (n,) [rad] until the fingertips arrive where J x puts them, within the limits."""
+    """Correct x (n,) [rad] until the fingertips arrive where J x puts them, within the limits.
+
+    A correction that is not certified is not made: the x before it keeps the limits.
+    """
     limits = stack.limit_levels(grasp)
     points = robot.points(grasp)
     goal = robot.centers(grasp.q, points).ravel() + grasp.jacobian @ x
@@ -32,5 +35,8 @@ def land(robot: Robot, stack: Stack, grasp: Grasp, x: np.ndarray) -> np.ndarray:
         ]
         A = np.concatenate([robot.jacobian(grasp.q + x, points), damping])
         b = np.concatenate([rest, np.zeros(grasp.n)])
-        x = x + hqp.solve([*levels, Level.equal(A, b, "landing")]).x
+        correction = hqp.solve([*levels, Level.equal(A, b, "landing")])
+        if not correction.certified:
+            break
+        x = x + correction.x
     return x

@@ -222,7 +222,7 @@ def _extent(scene: Scene) -> float:
 def _placed(
     scene: Scene, q: np.ndarray, fixed: list[int], place: _Place
 ) -> tuple[Scene, np.ndarray] | None:
-    """Joints, from q on, that bring the palm to its place; None where the arm cannot."""
+    """Joints, from q on, that bring the palm to its place; None where no step is shown to."""
     robot = scene.articulated
     p_palm = place.position(np.array(scene.position))
     R_palm = place.rotation(robot.palm(robot.home)[1])
@@ -251,7 +251,10 @@ def _inverse_kinematics(
             Level.equal(robot.palm_jacobian(q), error),
             Level.equal(np.eye(robot.n)[free], 0.1 * (robot.home - q)[free]),
         ]
-        q = np.clip(q + hqp.solve(levels).x, robot.q_lower, robot.q_upper)
+        step = hqp.solve(levels)
+        if not step.certified:
+            return None
+        q = np.clip(q + step.x, robot.q_lower, robot.q_upper)
     return None
 
 

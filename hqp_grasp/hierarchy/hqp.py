@@ -7,12 +7,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, SolverError, one_of
+from hqp_grasp.errors import InputError, SolverError, number, one_of
 from hqp_grasp.hierarchy import active_set
-from hqp_grasp.hierarchy.level import Level, LevelReport, Solution, Stacked, optimality, stack
+from hqp_grasp.hierarchy.level import (
+    Level,
+    LevelReport,
+    Solution,
+    Stacked,
+    optimality,
+    stack,
+    tolerance_of,
+)
 from hqp_grasp.hierarchy.qp_solvers import BACKENDS, QPSolverError, active_rows
 
 COARSE = 1e-13  # [–] rank tolerance where the answer by the default's is not certified
+OTHERS = ("daqp", "proxqp")  # asked where neither the chosen solver nor the search is certified
+MOST = 1e15  # [multiply-adds] days: no budget, and near to what an integer holds
 ROUNDS = 10  # in which many rows may change at once, before the search moves one row at a time
 
 
@@ -31,8 +41,9 @@ class HQP:
     them by itself: it starts from the equalities alone, or from the active set of `warm`.
 
     The answer is certified: optimality is checked from x and the levels. Where that fails, the
-    search from the equalities is tried, then the one that moves one row at a time. If none is
-    certified within the budget, the best of them is returned, and says so (`Solution.certified`).
+    search from the equalities is tried, then the other QP solvers, then the search that moves one
+    row at a time. If none is certified within the budget, the best of them is returned, and says so
+    (`Solution.certified`).
     Where several x are optimal the shortest is returned; where it is not shown to be that,
     `Solution.failed` says so.
     """
@@ -43,19 +54,28 @@ class HQP:
 
     def __post_init__(self) -> None:
         one_of("solver", self.solver, solvers())
-        if self.rank_tolerance is not None and not 0.0 <= self.rank_tolerance < 1.0:
-            raise InputError(f"rank_tolerance must lie in [0, 1); got {self.rank_tolerance}")
-        if not self.budget > 0:
-            raise InputError(f"budget must be above 0 multiply-adds; got {self.budget}")
+        object.__setattr__(self, "rank_tolerance", tolerance_of(self.rank_tolerance))
+        budget = number("budget", self.budget)
+        if not 0 < budget < MOST:
+            raise InputError(
+                f"budget must be above 0 and below {MOST:.0e} multiply-adds; got {self.budget}"
+            )
+        object.__setattr__(self, "budget", int(np.ceil(budget)))
 
     def solve(self, levels: Level | Sequence[Level], warm: Solution | None = None) -> Solution:
         """Return the optimum of `levels`, first level first.
 
         `warm`: the solution of a similar hierarchy, whose active set "active-set" tries first.
         Where it does not fit that costs time; a QP solver makes no use of it.
-        Raises InputError for levels that disagree on the number of unknowns, and SolverError
-        where no way leads to a finite x: numbers beyond the range of doubles.
+        Raises InputError for levels that disagree on the number of unknowns and for a `warm` that
+        is no Solution, and SolverError where no way leads to a finite x: numbers beyond the range
+        of doubles.
         """
+        if not (warm is None or isinstance(warm, Solution)):
+            raise InputError(
+                "warm must be the Solution of a similar hierarchy, or None; "
+                f"got {type(warm).__name__}"
+            )
         levels = [levels] if isinstance(levels, Level) else levels
         rows = stack(levels, self.rank_tolerance)
         failed: list[str] = []
@@ -100,12 +120,7 @@ class HQP:
         p = len(rows.frobenius)
         equalities = 2 * (rows.lower == rows.upper).view(np.int8)
         if self.solver != "active-set":
-            try:
-                act = active_rows(rows, BACKENDS[self.solver])
-            except QPSolverError as failure:
-                failed.append(f"{self.solver}: {failure}")
-            else:
-                yield self.solver, rows, act, p, ROUNDS
+            yield from _asked(self.solver, rows, failed)
         elif warm is not None and warm.active.shape == equalities.shape:
             act = equalities.copy()
             upper = (warm.active == 1) & (act == 0) & np.isfinite(rows.upper)
@@ -113,6 +128,9 @@ class HQP:
             act[upper], act[lower] = 1, -1
             yield "active-set", rows, act, p, ROUNDS
         yield "active-set", rows, equalities.copy(), 1, ROUNDS
+        for other in OTHERS:
+            if other != self.solver:
+                yield from _asked(other, rows, failed)
         coarse = 2.0 * self.rank_tolerance if self.rank_tolerance else COARSE
         yield "coarser rank", rows.with_rank(coarse), equalities.copy(), 1, ROUNDS
         yield "one row at a time", rows, equalities.copy(), p, 0
@@ -131,7 +149,8 @@ class HQP:
         is Projection(damping=λ)'s; its q_c is the `reference` (n,), here 0 unless given.
 
         `damping`: λ ≥ 0 in the squared units of A, one for all or one for each level; levels of
-        inequalities only, and levels with λ = 0, stay as they are.
+        inequalities only, and levels with λ = 0, stay as they are. Raises SolverError where the
+        answer of a damped level is not certified: those below would build on it.
         """
         levels = [levels] if isinstance(levels, Level) else levels
         n = stack(levels).A.shape[1]
@@ -151,13 +170,25 @@ class HQP:
             root = np.sqrt(square)
             A = np.concatenate([level.A, root * np.eye(n)])
             lower, upper = (np.append(b, root * toward) for b in (level.lower, level.upper))
-            value = level.A @ self.solve([*held, Level(A, lower, upper)]).x
+            value = level.A @ self.solve([*held, Level(A, lower, upper)]).certified_x
             equal = level.lower == level.upper
             lower = np.where(equal, value, np.minimum(level.lower, value))
             upper = np.where(equal, value, np.maximum(level.upper, value))
             name = f"{level.name}, damped" if level.name else "damped"
             held.append(Level(level.A, lower, upper, name))
         return held
+
+
+def _asked(
+    solver: str, rows: Stacked, failed: list[str]
+) -> Iterator[tuple[str, Stacked, np.ndarray, int, int]]:
+    """The way that a QP solver names; none, and a line in `failed`, where it names none."""
+    try:
+        act = active_rows(rows, BACKENDS[solver])
+    except QPSolverError as failure:
+        failed.append(f"{solver}: {failure}")
+    else:
+        yield solver, rows, act, len(rows.frobenius), ROUNDS
 
 
 def _numbers(value: object) -> np.ndarray:

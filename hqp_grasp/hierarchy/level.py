@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, SolverError, number
 from hqp_grasp.hierarchy.certificate import measure, optimality_faults
 
 CERTIFICATE_TOLERANCE = 1e-8  # [–] row-scaled; what `is_optimal` asks unless told otherwise
@@ -70,6 +70,10 @@ class Level:
         for field, array in (("A", A), ("lower", lower), ("upper", upper)):
             array.setflags(write=False)
             object.__setattr__(self, field, array)
+
+    def __reduce__(self) -> tuple[type[Level], tuple[object, ...]]:
+        """What is unpickled, or copied deeply, is built anew: checked, and locked again."""
+        return type(self), (self.A, self.lower, self.upper, self.name)
 
     def _fault(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> InputError:
         """What keeps the first faulty row from being one."""
@@ -133,6 +137,14 @@ class Solution:
         """True where some inequality row holds x at a bound."""
         return bool((np.abs(self.active) == 1).any())
 
+    @property
+    def certified_x(self) -> np.ndarray:
+        """x (n,), for those who act on it; raises SolverError where it is not certified."""
+        if not self.certified:
+            tried = "; ".join(self.failed)
+            raise SolverError(f"the best x found is not certified, and so not used: {tried}")
+        return self.x
+
     def is_optimal(
         self, levels: Level | Sequence[Level], tol: float = CERTIFICATE_TOLERANCE
     ) -> bool:
@@ -147,8 +159,18 @@ class Solution:
         Raises InputError where `levels` are not of the size of this solution.
         """
         return not optimality(
-            stack(levels, self.rank_tolerance), self.x, self.multipliers, tol
+            stack(levels, self.rank_tolerance), self.x, self.multipliers, number("tol", tol)
         ).faults
+
+
+def tolerance_of(rank_tolerance: object) -> float | None:
+    """A solver's rank tolerance [–] as a float in [0, 1), or None; else raise InputError."""
+    if rank_tolerance is None:
+        return None
+    found = number("rank_tolerance", rank_tolerance)
+    if not 0.0 <= found < 1.0:
+        raise InputError(f"rank_tolerance must lie in [0, 1); got {rank_tolerance}")
+    return found
 
 
 class Stacked(NamedTuple):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, number
 from hqp_grasp.hierarchy.certificate import EPS
 from hqp_grasp.hierarchy.level import (
     CERTIFICATE_TOLERANCE,
@@ -15,6 +15,7 @@ from hqp_grasp.hierarchy.level import (
     LevelReport,
     Solution,
     stack,
+    tolerance_of,
 )
 
 
@@ -35,10 +36,11 @@ class Projection:
     rank_tolerance: float | None = None  # [–] σ counts above this × ‖A_k‖₂; None: max(m, n)·eps
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.damping) and self.damping >= 0.0):
+        damping = number("damping", self.damping)
+        if not 0.0 <= damping < np.inf:
             raise InputError(f"damping must be ≥ 0; got {self.damping}")
-        if self.rank_tolerance is not None and not 0.0 <= self.rank_tolerance < 1.0:
-            raise InputError(f"rank_tolerance must lie in [0, 1); got {self.rank_tolerance}")
+        object.__setattr__(self, "damping", damping)
+        object.__setattr__(self, "rank_tolerance", tolerance_of(self.rank_tolerance))
 
     def solve(self, levels: Sequence[Level]) -> Solution:
         """Answer levels of equality rows only; raise InputError for any inequality row."""

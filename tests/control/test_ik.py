@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 from mink.tasks import BaseTask, Objective
 
 from hqp_grasp.control.ik import ik_levels, solve_ik
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, SolverError
 from hqp_grasp.hierarchy.hqp import HQP
 
 ROOT = Path(__file__).parents[2]
@@ -307,6 +308,27 @@ def test_malformed_arguments_are_refused_by_name(world):
             solve_ik(configuration, priorities, **({"dt": DT} | given))
     with pytest.raises(mink.InvalidFrame):
         solve_ik(configuration, [stranger], DT)
+
+
+@pytest.mark.parametrize("setting", ["dt", "damping"])
+@pytest.mark.parametrize("value", ["soon", None, [0.1, 0.1]])
+def test_a_time_or_a_damping_that_is_no_number_is_refused_by_name(world, setting, value):
+    configuration = world.configuration(world.inside())
+    with pytest.raises(InputError, match=f"{setting} must be a number"):
+        solve_ik(configuration, world.tasks(configuration), **({"dt": DT} | {setting: value}))
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_a_motion_that_is_not_certified_is_not_returned(world, monkeypatch, damping):
+    solve = HQP.solve
+
+    def doubtful(self, levels, warm=None):
+        return replace(solve(self, levels, warm), certified=False, failed=("why",))
+
+    monkeypatch.setattr(HQP, "solve", doubtful)
+    configuration = world.configuration(world.inside())
+    with pytest.raises(SolverError, match="not certified, and so not used: why"):
+        solve_ik(configuration, world.tasks(configuration), DT, damping=damping)
 
 
 def _limit_of_another_model() -> mink.Limit:

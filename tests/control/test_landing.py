@@ -1,5 +1,7 @@
 """Landing: the fingertips arrive where the linear prediction put them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from hqp_grasp.control.controller import Controller
 from hqp_grasp.control.landing import land
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import stack_of
 from hqp_grasp.world.scene import Scene
 
@@ -61,3 +64,20 @@ def test_a_step_that_lands_by_itself_is_left_as_it_is(robot, steps):
     for grasp, x in steps:
         tiny = 1e-4 * x
         np.testing.assert_array_equal(land(robot, stack, grasp, tiny), tiny)
+
+
+def test_a_correction_that_is_not_certified_is_not_made(robot, steps, monkeypatch):
+    stack = stack_of("fmk").within(StepLimit(2.0, 0.5), ConfigurationLimit(robot))
+    solve, certified = HQP.solve, []
+
+    def doubtful_from_the_second_on(self, levels, warm=None):
+        answer = solve(self, levels, warm)
+        certified.append(answer)
+        return answer if len(certified) == 1 else replace(answer, certified=False)
+
+    monkeypatch.setattr(HQP, "solve", doubtful_from_the_second_on)
+    for grasp, x in steps:
+        certified.clear()
+        landed = land(robot, stack, grasp, x)
+        assert len(certified) == 2
+        np.testing.assert_array_equal(landed, x + certified[0].x)

@@ -12,6 +12,7 @@ from hqp_grasp.errors import InputError, ReachError
 from hqp_grasp.experiments.start import MAX_PLACES, SHIFT, TURN, Start
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Grasp, Miss, Missed
+from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
@@ -242,6 +243,15 @@ def test_an_object_out_of_reach_is_named_with_the_way_out(position):
     scene = Scene(position=position)
     with pytest.raises(ReachError, match=r"from none of 2 drawn.*cannot reach.*move the object"):
         first_touch(scene, GeometricProbe(scene), np.random.default_rng(0), Start(max_draws=2))
+
+
+def test_a_posture_by_a_step_that_is_not_certified_is_none(scene, probe, monkeypatch):
+    solve = HQP.solve
+    monkeypatch.setattr(
+        HQP, "solve", lambda *given: dataclasses.replace(solve(*given), certified=False)
+    )
+    with pytest.raises(ReachError, match=r"from none of 2 drawn.*cannot reach"):
+        first_touch(scene, probe, np.random.default_rng(0), Start(max_draws=2))
 
 
 def test_the_last_reason_is_told(scene):

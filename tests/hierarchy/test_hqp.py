@@ -333,6 +333,13 @@ def test_a_warm_start_from_another_problem_does_no_harm():
         assert_same_point(again.x, cold.x)
 
 
+@pytest.mark.parametrize("solver", THREE)
+@pytest.mark.parametrize("warm", [np.zeros(2), [0, 1], "warm", 5, box(2, 1.0)])
+def test_a_warm_start_that_is_no_solution_is_refused_by_name(solver, warm):
+    with pytest.raises(InputError, match=f"warm must be the Solution .* {type(warm).__name__}"):
+        HQP(solver).solve(built([box(2, 1.0)]), warm=warm)
+
+
 def test_a_warm_start_never_holds_a_row_at_an_infinite_bound():
     one_sided = Rows(np.eye(3), np.full(3, -INF), np.ones(3))
     levels = built([one_sided, equal(np.eye(3), [2, 0, 0])])
@@ -464,6 +471,49 @@ def test_a_solver_that_answers_at_random_does_no_harm(monkeypatch):
         assert_same_misses(problem, answer.x, lexicographic_optimum(problem)[1])
 
 
+def searching(monkeypatch, failures):
+    """The first `failures` searches find nothing but x = 0."""
+    left, search = [failures], active_set.search
+
+    def first_in_vain(rows, act, *arguments):
+        if left[0] == 0:
+            return search(rows, act, *arguments)
+        left[0] -= 1
+        M, n, p = *rows.A.shape, len(rows.frobenius)
+        return np.zeros(n), np.zeros((M, p + 1)), np.zeros(p, np.int64), 0
+
+    monkeypatch.setattr(active_set, "search", first_in_vain)
+
+
+def test_before_an_uncertified_answer_goes_out_the_other_solvers_are_asked(monkeypatch):
+    problem = three_level(np.random.default_rng(0), "hard")
+    x, _ = lexicographic_optimum(problem)
+    for solver, failures, ways in (
+        ("active-set", 1, ["active-set", "daqp"]),
+        ("active-set", 2, ["active-set", "daqp", "proxqp"]),
+        ("proxqp", 2, ["proxqp", "active-set", "daqp"]),
+        ("daqp", 2, ["daqp", "active-set", "proxqp"]),
+        ("daqp", 4, ["daqp", "active-set", "proxqp", "coarser rank", "one row at a time"]),
+    ):
+        with monkeypatch.context() as patched:
+            searching(patched, failures)
+            answer = solve(problem, solver)
+        assert [*(fault.split(":")[0] for fault in answer.failed), answer.method] == ways
+        assert_same_point(answer.x, x)
+
+
+LANDING = np.load(Path(__file__).with_name("landing.npz"))
+
+
+def test_a_correction_of_43_joints_at_many_bounds_at_once_keeps_its_limits(solver):
+    """Levels of a step's landing, once answered 0.036 rad outside a range that x = 0 keeps."""
+    problem = [Rows(v[:, :-2], v[:, -2], v[:, -1]) for v in LANDING.values()]
+    answer = solve(problem, solver)
+    for level in built(problem[:3]):
+        assert np.abs(level.residual(np.zeros(43))).max() == 0.0
+        assert np.abs(level.residual(answer.x)).max() <= TOL * units(level, answer.x)
+
+
 # ---------------------------------------------------------------- invariance
 
 
@@ -581,6 +631,12 @@ def test_a_damped_level_admits_what_its_own_inequalities_were_left_with():
     assert levels[0].upper[1] == pytest.approx(0.0, abs=TOL) and levels[0].lower[1] == -INF
 
 
+def test_damped_levels_are_not_built_on_an_answer_that_is_not_certified(alone):
+    problem = scaling(np.random.default_rng(0), 30, 6)
+    with pytest.raises(SolverError, match="not certified, and so not used"):
+        HQP("active-set", budget=1).damped(built(problem), 1e-3)
+
+
 def test_each_level_may_have_a_damping_of_its_own():
     levels = [Level.equal([[1.0, 0.0]], [1.0]), Level.equal([[0.0, 1.0]], [1.0])]
     held = HQP().damped(levels, [0.0, 1.0], reference=[0.0, 3.0])
@@ -673,7 +729,13 @@ def test_grasps_with_parallel_normals_are_answered(solver, grasp):
 # ---------------------------------------------------------------- best effort
 
 
-def test_an_answer_beyond_the_budget_says_that_it_is_not_certified():
+@pytest.fixture
+def alone(monkeypatch):
+    """No other solver is asked."""
+    monkeypatch.setattr(hqp_module, "OTHERS", ())
+
+
+def test_an_answer_beyond_the_budget_says_that_it_is_not_certified(alone):
     levels = built(scaling(np.random.default_rng(0), 30, 6))
     hasty, sound = HQP("active-set", budget=1).solve(levels), HQP("active-set").solve(levels)
     assert sound.certified and not sound.failed
@@ -682,13 +744,13 @@ def test_an_answer_beyond_the_budget_says_that_it_is_not_certified():
     assert len(hasty.failed) == 3 and all("imbalance" in fault for fault in hasty.failed)
 
 
-def test_the_best_effort_is_the_same_to_the_bit_each_time():
+def test_the_best_effort_is_the_same_to_the_bit_each_time(alone):
     levels = built(scaling(np.random.default_rng(1), 30, 6))
     first, again = (HQP("active-set", budget=1).solve(levels) for _ in range(2))
     np.testing.assert_array_equal(first.x, again.x)
 
 
-def test_of_uncertified_answers_the_one_that_serves_most_levels_is_returned(monkeypatch):
+def test_of_uncertified_answers_the_one_that_serves_most_levels_is_returned(alone, monkeypatch):
     tries = iter([[2.0, 0.0], [0.5, 0.0], [3.0, 3.0], [np.nan, 0.5]])
 
     def fake(rows, act, *_):
@@ -715,7 +777,7 @@ def test_anything_with_dust_and_a_rank_tolerance_is_answered(seed):
     solve(problem, THREE[seed % 3], rank_tolerance=tolerance)
 
 
-@pytest.mark.parametrize("budget", [0, -1, np.nan])
+@pytest.mark.parametrize("budget", [0, -1, np.nan, INF, 10**30])
 def test_a_budget_that_is_none_is_refused(budget):
     with pytest.raises(InputError, match="budget must be above 0"):
         HQP(budget=budget)
@@ -752,6 +814,16 @@ def test_proxqp_is_the_default_and_the_list_names_no_solver_twice():
 def test_a_rank_tolerance_out_of_range_is_refused(tolerance):
     with pytest.raises(InputError, match="rank_tolerance must lie in"):
         HQP(rank_tolerance=tolerance)
+
+
+@pytest.mark.parametrize("wrong", ["much", None, [1.0, 2.0], {}])
+def test_settings_that_are_no_numbers_are_refused_by_name(wrong):
+    cases = [(HQP, "budget"), (Projection, "damping")]
+    if wrong is not None:
+        cases += [(HQP, "rank_tolerance"), (Projection, "rank_tolerance")]
+    for kind, setting in cases:
+        with pytest.raises(InputError, match=f"{setting} must be a number"):
+            kind(**{setting: wrong})
 
 
 @pytest.mark.parametrize("damping", [-1e-9, np.nan, INF, [0.1, -1.0], [0.1], [[0.1, 0.1]]])

@@ -1,12 +1,16 @@
 """Levels as they are built, and the certificate of optimality, which must trust nobody."""
 
+import copy
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracle import lexicographic_optimum
 from problems import Rows, box, equal, general, near_singular, three_level
 from test_oracle import HAND
 
-from hqp_grasp import HQP, InputError, Level, Solution
+from hqp_grasp import HQP, InputError, Level, Solution, SolverError
 from hqp_grasp.hierarchy.active_set import search
 from hqp_grasp.hierarchy.level import stack
 
@@ -144,6 +148,30 @@ def test_the_arrays_of_a_level_are_locked(field):
     level = Level(np.eye(2), [0, 0], [1, 1])
     with pytest.raises(ValueError, match="read-only"):
         getattr(level, field)[...] = 0.5
+
+
+@pytest.mark.parametrize(
+    "again",
+    [lambda v: pickle.loads(pickle.dumps(v)), copy.copy, copy.deepcopy, replace],
+    ids=["pickled", "copied", "copied deeply", "replaced"],
+)
+def test_a_level_that_was_pickled_or_copied_is_the_same_and_locked(again):
+    level = Level(np.eye(2), [0, -INF], [1, 1], "limits")
+    other = again(level)
+    assert other.name == "limits"
+    for field in ("A", "lower", "upper"):
+        array = getattr(other, field)
+        np.testing.assert_array_equal(array, getattr(level, field))
+        assert not array.flags.writeable
+
+
+def test_only_a_certified_answer_gives_its_x_to_those_who_act_on_it():
+    levels = [Level(np.eye(2), [0, 0], [1, 1]), Level.equal(np.eye(2), [2, 0.5])]
+    sound = HQP().solve(levels)
+    assert sound.certified_x is sound.x
+    doubtful = replace(sound, certified=False, failed=("proxqp: level 1: why",))
+    with pytest.raises(SolverError, match="not certified, and so not used: proxqp: level 1: why"):
+        _ = doubtful.certified_x
 
 
 @pytest.mark.parametrize("n", [1, 3, 4, 50, 2000])
