@@ -1,0 +1,76 @@
+"""Where the joints must be so that the palm is at a pose: inverse kinematics within the ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.world.robot import Robot
+
+MAX_STEPS = 60
+STEP = 0.3  # [rad]
+TOLERANCE = 1e-4  # [m, rad]
+HOMING = 0.1  # [–] share of the way to home that joints which are free to go take at a step
+RAISED = 0.02  # [m] the palm rises by between two postures of a lift
+
+
+def reach(
+    robot: Robot, q: np.ndarray, p_palm: np.ndarray, R_palm: np.ndarray, keep: Sequence[int]
+) -> np.ndarray | None:
+    """Joints (n,) [rad], from q (n,) on, that bring the palm to p (3,) [m], R (3, 3), world.
+
+    The joints `keep` stay; of the others those that the palm leaves free go home. None where the
+    arm cannot go there.
+    """
+    hqp = HQP("active-set")
+    free = np.array([j for j in range(robot.n) if j not in keep], dtype=int)
+    one = np.eye(robot.n)
+    for _ in range(MAX_STEPS):
+        p_now, R_now = robot.palm(q)
+        error = np.concatenate([p_palm - p_now, _turn(R_now, R_palm)])
+        if np.abs(error).max() < TOLERANCE:
+            return q
+        lower = np.maximum(-STEP, robot.q_lower - q)
+        upper = np.minimum(STEP, robot.q_upper - q)
+        levels = [
+            Level(one, lower, upper),
+            Level.equal(one[list(keep)], np.zeros(len(keep))),
+            Level.equal(robot.palm_jacobian(q), error),
+            Level.equal(one[free], HOMING * (robot.home - q)[free]),
+        ]
+        found = hqp.solve(levels)
+        if not found.certified:
+            return None
+        q = np.clip(q + found.x, robot.q_lower, robot.q_upper)
+    return None
+
+
+def lifted(robot: Robot, q: np.ndarray, height: float) -> list[np.ndarray] | None:
+    """Postures (n,) [rad] along which the arm raises the palm straight up by `height` [m].
+
+    The hand keeps its joints, the palm its orientation; below 0 it is set down. None where the arm
+    cannot go all the way.
+    """
+    p_palm, R_palm = robot.palm(q)
+    hand = [j for j in range(robot.n) if j not in robot.arm]
+    count = max(1, int(np.ceil(abs(height) / RAISED)))
+    way = []
+    for share in np.arange(1, count + 1) / count:
+        up = np.array([0.0, 0.0, share * height])
+        found = reach(robot, way[-1] if way else q, p_palm + up, R_palm, hand)
+        if found is None:
+            return None
+        way.append(found)
+    return way
+
+
+def _turn(R: np.ndarray, R_goal: np.ndarray) -> np.ndarray:
+    """Rotation vector (3,) [rad], world, from R to R_goal."""
+    quaternion, turn = np.zeros(4), np.zeros(3)
+    mujoco.mju_mat2Quat(quaternion, (R_goal @ R.T).ravel())
+    mujoco.mju_quat2Vel(turn, quaternion, 1.0)
+    return turn
