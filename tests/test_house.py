@@ -14,6 +14,7 @@ FLOORS = (
     ("history", "hierarchy", "world"),
     ("tasks",),
     ("control", "touch"),
+    ("judge",),
     ("experiments",),
     ("__init__",),
     ("__main__",),

@@ -58,7 +58,7 @@ def lifted(robot: Robot, q: np.ndarray, height: float) -> list[np.ndarray] | Non
     p_palm, R_palm = robot.palm(q)
     hand = [j for j in range(robot.n) if j not in robot.arm]
     count = max(1, int(np.ceil(abs(height) / RAISED)))
-    way = []
+    way: list[np.ndarray] = []
     for share in np.arange(1, count + 1) / count:
         up = np.array([0.0, 0.0, share * height])
         found = reach(robot, way[-1] if way else q, p_palm + up, R_palm, hand)

@@ -65,7 +65,9 @@ class Bench:
         self.told = grasp.q.copy()  # (n,) [rad] the servos' targets
         self._object = model.body(OBJECT).id
         collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        self._things = {int(g) for g in np.flatnonzero(collides & (model.geom_bodyid == self._object))}
+        self._things = {
+            int(g) for g in np.flatnonzero(collides & (model.geom_bodyid == self._object))
+        }
         self._tips = [{model.geom(robot.model.geom(g).name).id for g in gs} for gs in robot.geoms]
         self._support = model.geom(SUPPORT).id
         self._pose = palm_sensors(model)
@@ -79,15 +81,14 @@ class Bench:
     def _refuse_overlap(self) -> None:
         for contact in self.data.contact[: self.data.ncon]:
             one, other = contact.geom.tolist()
-            if {one, other} & self._things and self._support not in (one, other):
-                if contact.dist < -DEEPEST:
-                    link = other if one in self._things else one
-                    raise InputError(
-                        f"{self.model.geom(link).name} is {-1e3 * contact.dist:.1f} mm in the "
-                        "object: a grasp is judged from where its contacts touch"
-                    )
+            links = {one, other} - self._things - {self._support}
+            if len(links) == 1 and contact.dist < -DEEPEST:
+                raise InputError(
+                    f"{self.model.geom(links.pop()).name} is {-1e3 * contact.dist:.1f} mm in the "
+                    "object: a grasp is judged from where its contacts touch"
+                )
 
-    def clone_state(self) -> tuple[np.ndarray, np.ndarray]:
+    def saved(self) -> tuple[np.ndarray, np.ndarray]:
         """The state, to return to."""
         return self.state.copy(), self.warm.copy()
 
@@ -102,7 +103,9 @@ class Bench:
         q[self._driven] = self.state[1 + self._qpos]
         return q
 
-    def run(self, told: np.ndarray, duration: float, wrench: np.ndarray | None = None) -> np.ndarray:
+    def run(
+        self, told: np.ndarray, duration: float, wrench: np.ndarray | None = None
+    ) -> np.ndarray:
         """Lead the servos to `told` (n,) [rad] over `duration` [s]; return the object's poses.
 
         `wrench` (T, 6) [N, N·m] acts on the object at its centre of mass, world, step by step.
@@ -190,10 +193,12 @@ class Bench:
         touching = self.touching()
         if np.isnan(touching.positions).any():
             return None
+        q = self.q
+        levers = touching.positions - self.robot.centers(q)
         contacts = [
-            Contact(x, n, wrench=np.append(-f, np.zeros(3)))
-            for x, n, f in zip(
-                touching.positions, touching.normals, touching.forces, strict=True
+            Contact(x, n, wrench=np.concatenate([-f, np.cross(lever, -f)]))
+            for x, n, f, lever in zip(
+                touching.positions, touching.normals, touching.forces, levers, strict=True
             )
         ]
-        return self.robot.grasp(self.q, contacts)
+        return self.robot.grasp(q, contacts)

@@ -51,8 +51,10 @@ class Physics:
             )
 
 
-def simulated_model(scene: Scene, physics: Physics, links: str = "block") -> mujoco.MjModel:
-    """Robot, object and what it stands on, with sensors at the tips and servos.
+def simulated_model(
+    scene: Scene, physics: Physics, links: str = "block", feeling: bool = True
+) -> mujoco.MjModel:
+    """Robot, object and what it stands on, with servos, and sensors at the tips if `feeling`.
 
     With links="pass" only tips meet the object. A free object's joint bears its name, OBJECT; what
     it stands on is the geom SUPPORT. Force and torque of tip p are the sensors "p touch force" and
@@ -60,7 +62,7 @@ def simulated_model(scene: Scene, physics: Physics, links: str = "block") -> muj
     "joint torque". Idle joints are fixed at home. Raises InputError where tips cannot feel.
     """
     spec, robot = scene.spec(), scene.articulated
-    tips = round_tips(robot)
+    tips = round_tips(robot) if feeling or links == "pass" else []
     _set_options(spec, physics)
     _compensate(spec, 1.0 + physics.imperfections.gravity_error)
     _make_yield(spec.body(OBJECT), physics)
@@ -68,13 +70,22 @@ def simulated_model(scene: Scene, physics: Physics, links: str = "block") -> muj
         _set_down(spec, scene, physics.support)
     if links == "pass":
         _let_pass(spec, robot, tips)
-    _add_tip_sensors(spec, robot)
+    if feeling:
+        _add_tip_sensors(spec, robot)
     _brake(spec, robot)
     _add_torque_sensors(spec, np.array(robot.joints)[~robot.idle].tolist())
+    if physics.support != "fixed":
+        _add_palm_sensors(spec, robot)
     model = spec.compile()
     if physics.support != "fixed":
         _weigh(model, physics.mass)
     return model
+
+
+def palm_sensors(model: mujoco.MjModel) -> slice:
+    """Where the sensors say how a free object stands in the palm's frame: (7,) [m, quaternion]."""
+    first = int(model.sensor(f"{OBJECT} position").adr[0])
+    return slice(first, first + 7)
 
 
 def servos(model: mujoco.MjModel, joints: tuple[str, ...]) -> np.ndarray:
@@ -197,6 +208,21 @@ def _add_torque_sensors(spec: mujoco.MjSpec, joints: list[str]) -> None:
             type=mujoco.mjtSensor.mjSENS_JOINTACTFRC,
             objtype=mujoco.mjtObj.mjOBJ_JOINT,
             objname=joint,
+        )
+
+
+def _add_palm_sensors(spec: mujoco.MjSpec, robot: Robot) -> None:
+    for kind, word in (
+        (mujoco.mjtSensor.mjSENS_FRAMEPOS, "position"),
+        (mujoco.mjtSensor.mjSENS_FRAMEQUAT, "orientation"),
+    ):
+        spec.add_sensor(
+            name=f"{OBJECT} {word}",
+            type=kind,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=OBJECT,
+            reftype=mujoco.mjtObj.mjOBJ_XBODY,
+            refname=robot.model.body(robot.palm_body).name,
         )
 
 
