@@ -6,13 +6,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 
+from hqp_grasp.control.reach import reach
 from hqp_grasp.errors import InputError, ReachError
 from hqp_grasp.grasp import Grasp, Miss
-from hqp_grasp.hierarchy.hqp import HQP
-from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
@@ -24,9 +22,6 @@ SHIFT = 0.01  # [m] the palm moves by this along the vertical, away from an edge
 TURN = np.radians(15.0)  # [rad] and turns by this about its approach axis,
 BACK = 2  # having withdrawn by so many advances
 CLOSINGS = 16  # sampled postures of closing fingers
-MAX_IK_STEPS = 60
-IK_STEP = 0.3  # [rad]
-IK_TOLERANCE = 1e-4  # [m, rad]
 MOST_COMMON = 3  # reasons why draws were rejected that are told
 
 
@@ -230,41 +225,5 @@ def _placed(
         p_now, R_now = robot.palm(q)
         turn = R_palm @ R_now.T
         return scene.rebased(p_palm - turn @ p_now, turn), q
-    return _inverse_kinematics(scene, q, fixed, p_palm, R_palm)
-
-
-def _inverse_kinematics(
-    scene: Scene, q: np.ndarray, fixed: list[int], p_palm: np.ndarray, R_palm: np.ndarray
-) -> tuple[Scene, np.ndarray] | None:
-    robot = scene.articulated
-    hqp = HQP("active-set")
-    free = np.array([j for j in range(robot.n) if j not in fixed], dtype=int)
-    keep = np.eye(robot.n)[fixed]
-    for _ in range(MAX_IK_STEPS):
-        p_now, R_now = robot.palm(q)
-        error = np.concatenate([p_palm - p_now, _turn(R_now, R_palm)])
-        if np.abs(error).max() < IK_TOLERANCE:
-            return scene, q
-        levels = [
-            Level(np.eye(robot.n), *_box(robot, q)),
-            Level.equal(keep, np.zeros(len(fixed))),
-            Level.equal(robot.palm_jacobian(q), error),
-            Level.equal(np.eye(robot.n)[free], 0.1 * (robot.home - q)[free]),
-        ]
-        step = hqp.solve(levels)
-        if not step.certified:
-            return None
-        q = np.clip(q + step.x, robot.q_lower, robot.q_upper)
-    return None
-
-
-def _box(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.maximum(-IK_STEP, robot.q_lower - q), np.minimum(IK_STEP, robot.q_upper - q)
-
-
-def _turn(R: np.ndarray, R_goal: np.ndarray) -> np.ndarray:
-    """Rotation vector (3,) [rad], world, from R to R_goal."""
-    quaternion, turn = np.zeros(4), np.zeros(3)
-    mujoco.mju_mat2Quat(quaternion, (R_goal @ R.T).ravel())
-    mujoco.mju_quat2Vel(turn, quaternion, 1.0)
-    return turn
+    found = reach(robot, q, p_palm, R_palm, fixed)
+    return None if found is None else (scene, found)

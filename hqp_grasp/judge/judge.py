@@ -62,12 +62,12 @@ class Judge:
     the object is lifted, and then no more: the grip does not react to the pulls. In between the
     servos stay where they were told, so fingers yield like springs.
 
-    protocol="pulls": the object stands on a pedestal, is lifted by `lift`, and pulled at with forces
-    and torques along the world's axes, one after the other from the same state, growing until it has
-    moved by `slip` or turned by `turn` in the palm's frame. A hand without an arm has the pedestal
-    taken away instead. protocol="dexgraspbench": once squeezed, support and gravity go, and a force
-    of 10 m/s² times the mass acts for 2 s along each axis; it passes if the object never moved by 5 cm
-    or turned by 15° (Chen et al., "Dexonomy", 2025).
+    protocol="pulls": the object stands on a pedestal, is lifted by `lift`, and pulled at with
+    forces and torques along the world's axes, one after the other from the same state, growing
+    until it has moved by `slip` or turned by `turn` in the palm's frame. A hand without an arm has
+    the pedestal taken away instead. protocol="dexgraspbench": once squeezed, support and gravity
+    go, and a force of 10 m/s² times the mass acts for 2 s along each axis; it passes if the object
+    never moved by 5 cm or turned by 15° (as the benchmark DexGraspBench has it).
 
     The judge knows the object as it is. It is deterministic. Raises InputError, before anything
     moves, for a grasp that is not of the scene's robot, or that has a link in the object, and
