@@ -67,7 +67,7 @@ class Judge:
     until it has moved by `slip` or turned by `turn` in the palm's frame. A hand without an arm has
     the pedestal taken away instead. protocol="dexgraspbench": once squeezed, support and gravity
     go, and a force of 10 m/s² times the mass acts for 2 s along each axis; it passes if the object
-    never moved by 5 cm or turned by 15° (as the benchmark DexGraspBench has it).
+    never moved by 5 cm or turned by 15° (DexGraspBench; Chen, Ke and Wang, "BODex", 2024).
 
     The judge knows the object as it is. It is deterministic. Raises InputError, before anything
     moves, for a grasp that is not of the scene's robot, or that has a link in the object, and
