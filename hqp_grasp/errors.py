@@ -1,6 +1,10 @@
 """What can go wrong, each with the way out in its message."""
 
 import math
+import operator
+from numbers import Real
+
+import numpy as np
 
 
 class HqpGraspError(Exception):
@@ -48,27 +52,63 @@ class MissingExtraError(HqpGraspError, ImportError):
 
 
 def number(name: str, value: object) -> float:
-    """Return `value` as a float, else raise InputError."""
-    try:
-        return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be a number; got {value!r}") from error
+    """Return `value` as a float, else raise InputError: numbers of numpy are some, "1" is none."""
+    return _number(name, value, "a number")
+
+
+def _number(name: str, value: object, wanted: str) -> float:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise InputError(f"{name} must be {wanted}; got {value!r}")
+    return float(value)
 
 
 def positive(name: str, value: object) -> float:
     """Return `value` as a finite float above zero, else raise InputError."""
-    try:
-        found = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be a number above 0; got {value!r}") from error
+    found = _number(name, value, "a number above 0")
     if not 0.0 < found < math.inf:
         raise InputError(f"{name} must be finite and above 0; got {found}")
     return found
 
 
+def not_negative(name: str, value: object) -> float:
+    """Return `value` as a finite float of zero or above, else raise InputError."""
+    found = _number(name, value, "a number of at least 0")
+    if not 0.0 <= found < math.inf:
+        raise InputError(f"{name} must be finite and at least 0; got {found}")
+    return found
+
+
+def whole(name: str, value: object, least: int) -> int:
+    """Return `value` as an int of at least `least`, else raise InputError: 2.0 and "2" are none."""
+    try:
+        found = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        found = None
+    if found is None:
+        raise InputError(f"{name} must be a whole number; got {value!r}")
+    if found < least:
+        raise InputError(f"{name} must be at least {least}; got {found}")
+    return found
+
+
+def flag(name: str, value: object) -> bool:
+    """Return `value` as a bool, else raise InputError: "no" would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False; got {value!r}")
+    return bool(value)
+
+
+def instance(name: str, value: object, kind: type) -> None:
+    """Raise InputError unless `value` is of this class."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} must be a {kind.__name__}; got {value!r}")
+
+
 def one_of(name: str, value: object, choices: object) -> str:
     """Return `value` if it is among `choices`, else raise InputError listing them."""
     valid = [str(c) for c in choices]  # type: ignore[attr-defined]
-    if value not in valid:
+    if not isinstance(value, str) or value not in valid:
         raise InputError(f"unknown {name} {value!r}; choose one of: {', '.join(valid)}")
     return str(value)

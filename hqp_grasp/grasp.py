@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, number
+from hqp_grasp.errors import InputError, instance, not_negative, number
 
 UNIT_NORMAL_TOLERANCE = 1e-6  # | ‖n‖ − 1 | accepted in a sensed normal
 
@@ -70,13 +70,9 @@ class Contact:
             raise InputError(
                 f"Contact.flexion must list indices into q; got {self.flexion!r}"
             ) from error
-        set_field(self, "tip_radius", number("Contact.tip_radius", self.tip_radius))
+        for name in ("tip_radius", "noise"):
+            set_field(self, name, not_negative(f"Contact.{name}", getattr(self, name)))
         set_field(self, "confidence", number("Contact.confidence", self.confidence))
-        set_field(self, "noise", number("Contact.noise", self.noise))
-        if not (np.isfinite(self.tip_radius) and self.tip_radius >= 0.0):
-            raise InputError(f"Contact.tip_radius must be ≥ 0 [m]; got {self.tip_radius}")
-        if not (np.isfinite(self.noise) and self.noise >= 0.0):
-            raise InputError(f"Contact.noise must be ≥ 0 [rad]; got {self.noise}")
         if not 0.0 <= self.confidence <= 1.0:
             raise InputError(f"Contact.confidence must lie in [0, 1]; got {self.confidence}")
 
@@ -197,6 +193,9 @@ class Missed:
 
     reason: Miss
     where: str  # the contact point or link
+
+    def __post_init__(self) -> None:
+        instance("Missed.reason", self.reason, Miss)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from hqp_grasp.control.limits import (
     RetreatLimit,
     StepLimit,
 )
-from hqp_grasp.errors import HqpGraspError, InputError
+from hqp_grasp.errors import HqpGraspError, InputError, flag, instance, whole
 from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Priority, Stack, Task
@@ -95,12 +95,9 @@ class Controller:
     landing: bool = True  # correct each step by the hand's kinematics, see `land`
 
     def __post_init__(self) -> None:
-        if not isinstance(self.robot, Robot):
-            raise InputError(
-                f"Controller.robot must be a Robot, such as Scene().articulated; got {self.robot!r}"
-            )
-        if self.budget is not None and self.budget < 1:
-            raise InputError(f"a budget is at least 1 touch; got {self.budget}")
+        instance("Controller.robot, such as Scene().articulated,", self.robot, Robot)
+        if self.budget is not None:
+            object.__setattr__(self, "budget", whole("Controller.budget", self.budget, 1))
         stack = Stack.of(self.stack)
         if not any(limit.priority is Priority.CAP for limit in stack.limits):
             stack = stack.within(StepLimit())
@@ -112,9 +109,10 @@ class Controller:
         if self.robot.description.clearance > 0.0 and not watched:
             stack = stack.within(ClearanceLimit(self.robot))
         object.__setattr__(self, "stack", stack)
-        if isinstance(self.form, str):
+        if not isinstance(self.form, Form):
             object.__setattr__(self, "form", form_of(self.form))
         self.form.check(stack)  # type: ignore[union-attr]
+        object.__setattr__(self, "landing", flag("Controller.landing", self.landing))
 
     def step(self, history: Sequence[Touch]) -> Step:
         """Return where to touch next, given every touch so far, hits and misses, in order.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, cap_ratio
 from hqp_grasp.control.memory import SurfaceMemory, steadied
 from hqp_grasp.control.paper import laws, paper_levels, why_not
 from hqp_grasp.control.settling import Course
-from hqp_grasp.errors import one_of
+from hqp_grasp.errors import instance, one_of
 from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level, Solution
@@ -44,6 +44,7 @@ class Plan:
     exact: bool = False  # x leads to a posture, joint by joint: it is not to be landed
 
 
+@runtime_checkable
 class Form(Protocol):
     """From a stack with its limits and a grasp to the next step."""
 
@@ -79,6 +80,9 @@ class MemorylessForm:
 
     hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
 
+    def __post_init__(self) -> None:
+        instance("MemorylessForm.hqp", self.hqp, HQP)
+
     def check(self, stack: Stack) -> None:
         """Every stack has this form."""
 
@@ -102,6 +106,9 @@ class PaperHierarchyForm:
 
     hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
 
+    def __post_init__(self) -> None:
+        instance("PaperHierarchyForm.hqp", self.hqp, HQP)
+
     def check(self, stack: Stack) -> None:
         laws(stack)
 
@@ -121,6 +128,9 @@ class ClippedForm:
     """The strict projection of the same laws, scaled to the caps, then clipped to the ranges."""
 
     projection: Projection = field(default_factory=lambda: Projection(rank_tolerance=TOUCH_RANK))
+
+    def __post_init__(self) -> None:
+        instance("ClippedForm.projection", self.projection, Projection)
 
     def check(self, stack: Stack) -> None:
         """Every stack has this form."""
@@ -143,6 +153,9 @@ class PaperForm:
     """Gradients composed in contact space, mapped by the SR-inverse (eq. 11–13), then clipped."""
 
     projection: Projection = field(default_factory=lambda: Projection(damping=SR_DAMPING))
+
+    def __post_init__(self) -> None:
+        instance("PaperForm.projection", self.projection, Projection)
 
     def check(self, stack: Stack) -> None:
         laws(stack)
@@ -183,6 +196,9 @@ class HierarchyForm:
     hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
     shares: ClassVar[tuple[float, ...]] = (1.0, 0.5) * 4  # of a step, while nothing is touched
     careful_for: ClassVar[int] = 10  # touches, after the hand began again from its first grasp
+
+    def __post_init__(self) -> None:
+        instance("HierarchyForm.hqp", self.hqp, HQP)
 
     def check(self, stack: Stack) -> None:
         """Every stack has this form."""

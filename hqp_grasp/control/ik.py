@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import mink
 import numpy as np
 from mink.tasks import BaseTask
 
-from hqp_grasp.errors import InputError, number
+from hqp_grasp.errors import InputError, flag, instance, not_negative, positive
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks.limit import Priority
@@ -40,7 +41,9 @@ def solve_ik(
     `safety_break`, as mink does, mink.NotWithinConfigurationLimits for a start outside the joint
     ranges.
     """
-    if safety_break:
+    instance("configuration", configuration, mink.Configuration)
+    dt = positive("dt", dt)
+    if flag("safety_break", safety_break):
         configuration.check_limits(safety_break=True)
     hqp = HQP(solver)
     levels = ik_levels(configuration, priorities, dt, damping, limits, constraints, hqp)
@@ -66,27 +69,23 @@ def ik_levels(
     μ > 0, `hqp` first solves the damped priority under the levels above, and the level asks for
     the W Δq found. A task with a dense Hessian H and slope c gives the rows √H Δq = −√H⁺ c.
     """
-    dt, damping = number("dt", dt), number("damping", damping)
-    if not 0.0 < dt < np.inf:
-        raise InputError(f"dt must be a time above 0 s; got {dt}")
-    if not 0.0 <= damping < np.inf:
-        raise InputError(f"damping must be at least 0; got {damping}")
+    instance("configuration", configuration, mink.Configuration)
+    dt, damping = positive("dt", dt), not_negative("damping", damping)
     nv = configuration.nv
     if limits is None:
         limits = [mink.ConfigurationLimit(configuration.model)]
+    limits = _listed(limits, "limits")
     for limit in limits:
         _require(limit, mink.Limit, "limits")
     levels = [_limit_level(limit, configuration, dt) for limit in sorted(limits, key=_priority)]
-    for task in constraints or ():
+    for task in () if constraints is None else _listed(constraints, "constraints"):
         _require(task, mink.Task, "constraints")
         J, error = task.compute_jacobian(configuration), task.compute_error(configuration)
         _require_width(task, J, nv)
         levels.append(Level.equal(J, -task.gain * error, type(task).__name__))
-    if isinstance(priorities, BaseTask):
-        raise InputError("priorities must be a list of tasks or of lists of tasks; got one task")
     dampings = [0.0] * len(levels)
-    for priority in priorities:
-        tasks = [priority] if isinstance(priority, BaseTask) else list(priority)
+    for priority in _listed(priorities, "priorities"):
+        tasks = [priority] if isinstance(priority, BaseTask) else _listed(priority, "priorities")
         W, e, mu = _rows(tasks, configuration)
         levels.append(Level.equal(W, e, " + ".join(type(task).__name__ for task in tasks)))
         dampings.append(mu + damping)
@@ -157,6 +156,15 @@ def _dense(
         raise InputError(f"{name}: its objective falls for ever, c is outside the range of H")
     root = np.sqrt(value[kept])
     return root[:, None] * V[:, kept].T, -slope[kept] / root, 0.0
+
+
+def _listed(values: object, argument: str) -> list[Any]:
+    try:
+        return list(values)  # type: ignore[call-overload]
+    except TypeError as error:
+        raise InputError(
+            f"{argument} must be a list, even of one; got {type(values).__name__}"
+        ) from error
 
 
 def _require(value: object, kind: type, argument: str) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, number
+from hqp_grasp.errors import InputError, instance, number, positive
 from hqp_grasp.grasp import Grasp, as_array
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks import Stack
@@ -28,8 +28,10 @@ class StepLimit(Limit):
 
     def __post_init__(self) -> None:
         for name in ("joint", "contact"):
-            if not number(f"StepLimit.{name} must be above 0: it", getattr(self, name)) > 0.0:
-                raise InputError(f"StepLimit.{name} must be above 0; got {getattr(self, name)}")
+            value = number(f"StepLimit.{name}", getattr(self, name))
+            if not value > 0.0:
+                raise InputError(f"StepLimit.{name} must be above 0; got {value}")
+            object.__setattr__(self, name, value)
 
     def level(self, grasp: Grasp) -> Level:
         rows = [np.eye(grasp.n) / self.joint] if np.isfinite(self.joint) else []
@@ -51,8 +53,9 @@ class VelocityLimit(Limit):
     def __post_init__(self) -> None:
         velocity = as_array("VelocityLimit.velocity", self.velocity, (None,))
         object.__setattr__(self, "velocity", velocity)
-        if not (velocity > 0.0).all() or not (np.isfinite(self.dt) and self.dt > 0.0):
-            raise InputError("VelocityLimit needs velocities and dt above 0")
+        object.__setattr__(self, "dt", positive("VelocityLimit.dt", self.dt))
+        if not (velocity > 0.0).all():
+            raise InputError(f"VelocityLimit.velocity must be above 0; got {velocity}")
 
     def level(self, grasp: Grasp) -> Level:
         if len(self.velocity) != grasp.n:
@@ -72,6 +75,9 @@ class ConfigurationLimit(Limit):
 
     robot: Robot
     priority = Priority.RANGE
+
+    def __post_init__(self) -> None:
+        instance("ConfigurationLimit.robot", self.robot, Robot)
 
     def level(self, grasp: Grasp) -> Level:
         lower, upper = self.robot.lower, self.robot.upper

@@ -138,6 +138,11 @@ def _one_blas_thread() -> Iterator[None]:
 
 def address_of(cluster: str | Path) -> str:
     """The scheduler's address: as it stands, or as the scheduler wrote it into a file."""
+    if not isinstance(cluster, str | Path):
+        raise InputError(
+            f"a cluster is told by its scheduler's address, such as cluster.scheduler_address of a "
+            f"LocalCluster; got a {type(cluster).__name__}"
+        )
     text, path = str(cluster), Path(cluster)
     if path.is_file():
         try:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hqp_grasp.control.reach import reach
-from hqp_grasp.errors import InputError, ReachError
-from hqp_grasp.grasp import Grasp, Miss
+from hqp_grasp.errors import InputError, ReachError, positive, whole
+from hqp_grasp.grasp import Grasp, Miss, as_array
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
@@ -59,11 +59,12 @@ class Start:
 
     def __post_init__(self) -> None:
         for name in ("adduction", "elevation", "offset"):
-            low, high = getattr(self, name)
-            if not -np.inf < low <= high < np.inf:
+            low, high = as_array(f"Start.{name}", getattr(self, name), (2,)).tolist()
+            if low > high:
                 raise InputError(f"Start.{name} must be a range (low, high); got {(low, high)}")
-        if not self.advance > 0.0 or self.max_draws < 1:
-            raise InputError("Start needs an advance above 0 and at least 1 draw")
+            object.__setattr__(self, name, (low, high))
+        object.__setattr__(self, "advance", positive("Start.advance [m]", self.advance))
+        object.__setattr__(self, "max_draws", whole("Start.max_draws", self.max_draws, 1))
 
     def draw(
         self, scene: Scene, probe_in: Callable[[Scene], Probe], rng: np.random.Generator

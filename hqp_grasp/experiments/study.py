@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from hqp_grasp.errors import InputError, ResultsError, TrialError, WorkerError
+from hqp_grasp.errors import ResultsError, TrialError, WorkerError, flag, instance, whole
 from hqp_grasp.experiments.executor import DEATHS, address_of, run_all, tell
 from hqp_grasp.experiments.fingerprint import Fingerprint, cpu_kind, differences
 from hqp_grasp.experiments.parts import Parts
@@ -55,9 +55,10 @@ class Study:
     cluster: str | Path | None = None
 
     def __post_init__(self) -> None:
+        instance("Study.trial", self.trial, Trial)
         for name, least in (("trials", 1), ("seed", 0), ("jobs", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name} must be at least {least}; got {getattr(self, name)}")
+            object.__setattr__(self, name, whole(name, getattr(self, name), least))
+        object.__setattr__(self, "strict", flag("strict", self.strict))
         if self.cluster is not None:
             address_of(self.cluster)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hqp_grasp.control.controller import Controller, Step
 from hqp_grasp.control.forms import Form
-from hqp_grasp.errors import InputError, ReachError, one_of
+from hqp_grasp.errors import InputError, ReachError, flag, instance, one_of, whole
 from hqp_grasp.experiments.record import (
     Record,
     empty_row,
@@ -58,6 +58,7 @@ class Trial:
     start: Start | Grasp = field(default_factory=Start)
 
     def __post_init__(self) -> None:
+        instance("Trial.scene", self.scene, Scene)
         one_of("links", self.links, ("pass", "block"))
         if not isinstance(self.probe, Physics):
             one_of("probe", self.probe, ("geometric", "physical"))
@@ -66,12 +67,14 @@ class Trial:
             if self.physics is None:
                 raise InputError(f"preset {self.preset!r} needs probe='physical'")
             object.__setattr__(self, "probe", replace(self.physics, imperfections=imperfections))
+        if not isinstance(self.noise, Noise | None):
+            raise InputError(f"Trial.noise must be a Noise, or None; got {self.noise!r}")
         if self.noise is not None and self.physics is not None:
             raise InputError(
                 "noise is for probe='geometric'; a simulated hand's sensors have a preset"
             )
-        if self.probes < 1:
-            raise InputError(f"a trial needs at least 1 probe; got {self.probes}")
+        object.__setattr__(self, "probes", whole("probes", self.probes, 1))
+        object.__setattr__(self, "landing", flag("landing", self.landing))
         if not isinstance(self.start, Start | Grasp):
             raise InputError(f"Trial.start must be a Start or a Grasp; got {self.start!r}")
         object.__setattr__(self, "stack", Stack.of(self.stack))

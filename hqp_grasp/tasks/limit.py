@@ -11,7 +11,7 @@ import mink
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError
+from hqp_grasp.errors import InputError, positive
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.level import Level
 
@@ -43,6 +43,9 @@ class MinkLimit(Limit):
     dt: float = 1.0  # [s] a probe may take; only velocity limits read it
 
     def __post_init__(self) -> None:
+        if not isinstance(self.limit, mink.Limit):
+            raise InputError(f"MinkLimit.limit must be a limit of mink; got {self.limit!r}")
+        object.__setattr__(self, "dt", positive("MinkLimit.dt", self.dt))
         if self.model is None and not isinstance(self.limit, mink.VelocityLimit):
             model = getattr(self.limit, "model", None)
             if model is None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import mink
 import numpy as np
 
-from hqp_grasp.errors import InputError, positive
+from hqp_grasp.errors import InputError, flag, positive
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks.limit import Limit, MinkLimit
@@ -73,7 +73,11 @@ class Stack:
     hold_contacts: bool = True  # ContactTask between the limits and the laws
 
     def __post_init__(self) -> None:
-        full = self.priorities and all(isinstance(p, tuple) and p for p in self.priorities)
+        object.__setattr__(self, "hold_contacts", flag("Stack.hold_contacts", self.hold_contacts))
+        if not all(isinstance(limit, Limit) for limit in _tuple("limits", self.limits)):
+            raise InputError(f"Stack.limits must be limits; got {self.limits!r}")
+        priorities = _tuple("priorities", self.priorities)
+        full = priorities and all(isinstance(p, tuple) and p for p in priorities)
         if not full or not all(isinstance(t, Task) for p in self.priorities for t in p):
             raise InputError(
                 "Stack.priorities must be tuples of control laws, none of them empty; "
@@ -159,6 +163,12 @@ class Stack:
         for tasks in self.priorities:
             levels.append(_joined(_level(task, grasp) for task in tasks))
         return levels
+
+
+def _tuple(name: str, value: object) -> tuple:
+    if not isinstance(value, tuple):
+        raise InputError(f"Stack.{name} must be a tuple; got {value!r}")
+    return value
 
 
 def _task(value: object) -> Task:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -31,8 +31,9 @@ class DriverLimits:
                 raise InputError(f"DriverLimits.{name} must be above 0; got {array}")
         if not (self.lower < self.upper).all():
             raise InputError("DriverLimits: every lower end must be below its upper one")
-        positive("DriverLimits.force", self.force)
-        positive("DriverLimits.watchdog", self.watchdog)
+        for name in ("force", "watchdog"):
+            value = positive(f"DriverLimits.{name}", getattr(self, name))
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,7 @@ class Readings:
             object.__setattr__(self, name, flags)
 
 
+@runtime_checkable
 class Driver(Protocol):
     """A hand as its controller offers it; docs/real-hand.md shows one being written.
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, one_of
+from hqp_grasp.errors import InputError, instance, one_of
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import CAPSULE, SPHERE
@@ -71,6 +71,7 @@ class GeometricProbe:
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        instance("GeometricProbe.scene", self.scene, Scene)
         one_of("links", self.links, ("pass", "block"))
         robot, model = self.scene.articulated, self.scene.model
         for point, way in zip(robot.description.contact_points, robot.closing, strict=True):

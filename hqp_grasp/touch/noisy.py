@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, number
+from hqp_grasp.errors import not_negative
 from hqp_grasp.grasp import Contact, Grasp, Missed
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.world.robot import Robot
@@ -24,9 +24,7 @@ class Noise:
 
     def __post_init__(self) -> None:
         for name in ("normal", "position"):
-            value = number(f"Noise.{name}", getattr(self, name))
-            if not 0.0 <= value < np.inf:
-                raise InputError(f"Noise.{name} must be finite and at least 0; got {value}")
+            value = not_negative(f"Noise.{name}", getattr(self, name))
             object.__setattr__(self, name, value)
 
 

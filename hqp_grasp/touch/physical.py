@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, positive
+from hqp_grasp.errors import InputError, instance, number, positive
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
 from hqp_grasp.touch.driver import Driver, Readings
 from hqp_grasp.touch.geometric import RETREAT
@@ -62,7 +62,14 @@ class PhysicalProbe:
     _own: tuple[tuple[int, list[int]], ...] = field(init=False, repr=False)  # tips, what they meet
 
     def __post_init__(self) -> None:
-        positive("PhysicalProbe.force", self.force)
+        instance("PhysicalProbe.robot", self.robot, Robot)
+        if not isinstance(self.driver, Driver):
+            raise InputError(
+                f"PhysicalProbe.driver must have all that a Driver has; got {self.driver!r}"
+            )
+        object.__setattr__(self, "force", positive("PhysicalProbe.force", self.force))
+        if self.table is not None:
+            object.__setattr__(self, "table", number("PhysicalProbe.table", self.table))
         most = self.driver.limits.force
         if self.force > most:
             raise InputError(f"PhysicalProbe.force {self.force} N is above the driver's {most} N")

@@ -29,7 +29,7 @@ def sense(wrench: np.ndarray, tip: float | Sequence[float]) -> tuple[np.ndarray,
     Raises InputError for a wrench without force, or one that no single contact can cause.
     """
     felt = as_array("sense: wrench", wrench, (6,))
-    axes = as_array("sense: tip", np.broadcast_to(np.asarray(tip, dtype=float), (3,)), (3,))
+    axes = as_array("sense: tip", [tip] * 3 if np.ndim(tip) == 0 else tip, (3,))
     if not (axes > 0.0).all():
         raise InputError(f"sense: a tip's radius or semi-axes are above 0 [m]; got {tip!r}")
     f = felt[:3] / axes

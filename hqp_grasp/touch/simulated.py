@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from hqp_grasp.errors import InputError, one_of, positive
+from hqp_grasp.errors import InputError, instance, one_of, positive
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.touch.driver import DriverLimits, Readings
 from hqp_grasp.touch.geometric import OVERLAP, RETREAT
@@ -73,8 +73,13 @@ class SimulatedHand:
         force_limit: float = 15.0,  # [N] as the BarrettHand presses
         watchdog: float = 1.0,  # [s]
     ) -> None:
+        instance("SimulatedHand.scene", scene, Scene)
         one_of("links", links, ("pass", "block"))
-        physics = physics or Physics()
+        physics = Physics() if physics is None else physics
+        instance("SimulatedHand.physics", physics, Physics)
+        rng = np.random.default_rng(0) if rng is None else rng
+        instance("SimulatedHand.rng", rng, np.random.Generator)
+        force_limit = positive("SimulatedHand.force_limit", force_limit)
         about, timestep = physics.imperfections, physics.timestep
         self.robot = scene.articulated
         k, n = len(self.robot.flexion), self.robot.n
@@ -128,7 +133,7 @@ class SimulatedHand:
         )
         self._lower, self._upper = robot.q_lower + MARGIN, robot.q_upper - MARGIN
         self.rate = 1.0 / (self._every * timestep)
-        self._rng = rng or np.random.default_rng(0)
+        self._rng = rng
         self._arm = np.isin(robot.joints, robot.description.arm)
         self._errors = SensorErrors(about, k, self._arm, self._rng)
         self._late = round(about.latency / timestep)

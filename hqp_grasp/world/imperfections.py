@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, number, one_of
+from hqp_grasp.errors import InputError, not_negative, number, one_of, whole
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,9 @@ class Fault:
 
     def __post_init__(self) -> None:
         one_of("fault", self.kind, FAULTS)
+        object.__setattr__(self, "finger", whole("Fault.finger", self.finger, 0))
+        object.__setattr__(self, "begin", number("Fault.begin", self.begin))
+        object.__setattr__(self, "duration", number("Fault.duration", self.duration))
 
 
 FAULTS = {
@@ -59,12 +62,11 @@ class Imperfections:
 
     def __post_init__(self) -> None:
         for at in fields(self)[:-1]:
-            value = number(f"Imperfections.{at.name}", getattr(self, at.name))
-            if not 0.0 <= value < np.inf and at.name != "gravity_error":
-                raise InputError(
-                    f"Imperfections.{at.name} must be finite and at least 0; got {value}"
-                )
+            least = number if at.name == "gravity_error" else not_negative
+            value = least(f"Imperfections.{at.name}", getattr(self, at.name))
             object.__setattr__(self, at.name, value)
+        if not isinstance(self.faults, tuple) or not all(isinstance(f, Fault) for f in self.faults):
+            raise InputError(f"Imperfections.faults must be a tuple of Fault; got {self.faults!r}")
 
     @classmethod
     def preset(cls, name: str | None, **changes: Any) -> Imperfections:

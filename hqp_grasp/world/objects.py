@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from hqp_grasp.errors import InputError, positive
+from hqp_grasp.errors import InputError, instance, positive, whole
 from hqp_grasp.world.description import locate
 
 OBJECT = "object"  # name of the object's body and of its first geom in a scene
@@ -44,8 +44,9 @@ class Cylinder:
     height: float = 0.12  # [m]
 
     def __post_init__(self) -> None:
-        positive("Cylinder.radius", self.radius)
-        positive("Cylinder.height", self.height)
+        for name in ("radius", "height"):
+            value = positive(f"Cylinder.{name}", getattr(self, name))
+            object.__setattr__(self, name, value)
 
     def add_geoms(self, spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
         """Put the geom into `body`, centred."""
@@ -66,7 +67,7 @@ class Prism:
     height: float = 0.12  # [m]
 
     def __post_init__(self) -> None:
-        positive("Prism.height", self.height)
+        object.__setattr__(self, "height", positive("Prism.height", self.height))
         try:
             corners = np.asarray(self.polygon, dtype=float)
         except (TypeError, ValueError) as error:
@@ -90,9 +91,7 @@ class Prism:
     @classmethod
     def regular(cls, sides: int, side: float, height: float = 0.12) -> Prism:
         """A regular polygon with sides of `side` [m], one corner on the x axis."""
-        positive("Prism side", side)
-        if sides < 3:
-            raise InputError(f"Prism.regular needs at least 3 sides; got {sides}")
+        side, sides = positive("Prism side", side), whole("the number of a Prism's sides", sides, 3)
         angles = 2.0 * np.pi * np.arange(sides) / sides
         radius = side / (2.0 * np.sin(np.pi / sides))
         corners = radius * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -119,7 +118,7 @@ def read_corners(file: str | Path, scale: float = 1.0) -> np.ndarray:
     The first line may be a header; `scale` is the file's unit [m]. Raises InputError for what is
     no strictly convex outline of a size to grasp, naming the line.
     """
-    positive("scale", scale)
+    scale = positive("scale", scale)
     path = Path(file)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -234,7 +233,10 @@ class Body:
     _pieces: tuple[_Piece, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        positive("Body.scale", self.scale)
+        object.__setattr__(self, "scale", positive("Body.scale", self.scale))
+        instance("Body.content", self.content, str)
+        if not isinstance(self.file, str | Path) or not str(self.file):
+            raise InputError(f"Body.file must be the path of an MJCF or a mesh; got {self.file!r}")
         path = locate(str(Path(self.file).expanduser()), Path.cwd()).absolute()
         pieces = _load(path)
         felt = [piece for piece in pieces if piece.felt]

@@ -43,7 +43,7 @@ class Physics:
         one_of("contact", self.contact, CONTACTS)
         one_of("support", self.support, SUPPORTS)
         for name in ("mass", "friction", "timestep"):
-            positive(f"Physics.{name}", getattr(self, name))
+            object.__setattr__(self, name, positive(f"Physics.{name}", getattr(self, name)))
         if not isinstance(self.imperfections, Imperfections):
             raise InputError(
                 "Physics.imperfections must be Imperfections, such as "

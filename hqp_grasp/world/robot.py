@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, ModelError
+from hqp_grasp.errors import InputError, ModelError, instance
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.world.description import (
     SLIDE_SPEED,
@@ -74,6 +74,8 @@ class Robot:
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         model, about = self.model, self.description
+        instance("Robot.description", about, RobotDescription)
+        instance("Robot.model", model, mujoco.MjModel)
         for j in range(model.njnt):
             if model.jnt_type[j] not in (HINGE, SLIDE):
                 raise ModelError(

@@ -262,7 +262,7 @@ def test_a_malformed_history_is_refused(robot, stack, history, message):
             {"form": "papr"},
             "unknown form 'papr'; choose one of: hierarchy, memoryless, paper-hierarchy, ",
         ),
-        ({"budget": 0}, "at least 1 touch"),
+        ({"budget": 0}, "budget must be at least 1"),
         ({"robot": "wam_bhand"}, "must be a Robot"),
         ({"stack": "fmk"}, "'fmk' is no control law"),
         ({"form": "paper", "stack": KinematicTask() >> ForceTask()}, "kinematic law last"),

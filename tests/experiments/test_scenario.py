@@ -341,7 +341,7 @@ def test_help_teaches_every_option_with_its_unit_or_choices(capsys):
         (["--stack", ""], ["f (force)"]),
         (["--solver", "simplex"], ["'simplex'", "proxqp", "daqp"]),
         (["--trials", "0"], ["trials", "at least 1"]),
-        (["--probes", "0"], ["at least 1 probe"]),
+        (["--probes", "0"], ["probes must be at least 1"]),
         (["--seed", "-1"], ["seed", "at least 0"]),
         (["--joint-cap", "-1"], ["StepLimit.joint", "above 0"]),
         (["--contact-cap", "nan"], ["StepLimit.contact", "above 0"]),

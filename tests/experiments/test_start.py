@@ -277,9 +277,9 @@ def test_a_hand_without_an_arm_is_placed_where_the_draw_says(seed):
     ("setting", "message"),
     [
         ({"adduction": (1.0, 0.5)}, r"Start.adduction must be a range \(low, high\)"),
-        ({"elevation": (0.5, np.nan)}, "Start.elevation must be a range"),
-        ({"advance": 0.0}, "an advance above 0"),
-        ({"max_draws": 0}, "at least 1 draw"),
+        ({"elevation": (0.5, np.nan)}, "Start.elevation must be finite"),
+        ({"advance": 0.0}, r"Start.advance \[m\] must be finite and above 0"),
+        ({"max_draws": 0}, "Start.max_draws must be at least 1"),
     ],
 )
 def test_a_malformed_start_is_refused(setting, message):

@@ -205,7 +205,7 @@ def test_without_landing_short_steps_descend_too(scene, stack, records):
     [
         ({"form": "hirarchy"}, r"unknown form 'hirarchy'.*hierarchy, clipped, paper"),
         ({"links": "stop"}, r"unknown links 'stop'.*pass, block"),
-        ({"probes": 0}, r"at least 1 probe; got 0"),
+        ({"probes": 0}, "probes must be at least 1; got 0"),
     ],
 )
 def test_a_wrong_setting_is_named_with_the_valid_ones(scene, stack, setting, message):
