@@ -16,6 +16,7 @@ from hqp_grasp.world.scene import Scene
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+NOSLIP = 2  # iterations after each step that keep edges from creeping
 DEEPEST = 1e-3  # [m] that a grasp to be tested may have a link in the object
 PRESSED = 1e-3  # [N] below which a contact counts as none
 
@@ -45,6 +46,7 @@ class Bench:
     def __init__(self, scene: Scene, grasp: Grasp, physics: Physics) -> None:
         self.robot = robot = scene.articulated
         self.model = model = simulated_model(scene, physics, feeling=False)
+        model.opt.noslip_iterations = NOSLIP
         self.data = data = mujoco.MjData(model)
         self._rollout = Rollout(nthread=0)
         driven = np.flatnonzero(~robot.idle)
