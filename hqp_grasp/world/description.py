@@ -17,6 +17,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, ModelError, number, one_of, positive
 from hqp_grasp.grasp import as_array
+from hqp_grasp.world.compiling import compiled_spec, read_afresh
 
 SPEED, SLIDE_SPEED = 1.0, 0.25  # [rad/s], [m/s] of joints for which a description gives none
 CLEARANCE = 0.005  # [m] that links keep between them
@@ -77,6 +78,7 @@ class ModelFile:
 
     def spec(self) -> mujoco.MjSpec:
         """The file alone, as MuJoCo reads it."""
+        read_afresh()
         try:
             if self.is_urdf:
                 spec = mujoco.MjSpec.from_string(self._urdf())
@@ -331,7 +333,7 @@ class RobotDescription:
         if len(roots) != 1 or roots[0].joints or spec.worldbody.geoms:
             raise ModelError(f"{self.name}: a carriage carries one root body without joints")
         alone = replace(self, carriage=False).spec()
-        model = alone.compile()
+        model = compiled_spec(alone, f"{self.xml.name} does not compile")
         data = mujoco.MjData(model)
         for joint, angle in self.home_angles(alone).items():
             if joint not in CARRIAGE:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from hqp_grasp.errors import InputError, instance, positive, whole
+from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import locate
 
 OBJECT = "object"  # name of the object's body and of its first geom in a scene
@@ -301,9 +302,9 @@ def _load(path: Path) -> list[_Piece]:
             spec = mujoco.MjSpec.from_file(str(path))
             for each in spec.meshes:
                 each.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        model = spec.compile()
     except (ValueError, OSError) as error:
         raise InputError(f"MuJoCo cannot read {path}: {_reason(error)}") from error
+    model = compiled_spec(spec, f"MuJoCo cannot read {path}")
     _require_one_rigid_object(path, model)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from hqp_grasp.errors import InputError, ModelError, one_of, positive
+from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.imperfections import Imperfections
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
@@ -76,7 +77,7 @@ def simulated_model(
     _add_torque_sensors(spec, np.array(robot.joints)[~robot.idle].tolist())
     if physics.support != "fixed":
         _add_palm_sensors(spec, robot)
-    model = spec.compile()
+    model = compiled_spec(spec, f"{robot.description.xml.name} does not compile")
     if physics.support != "fixed":
         _weigh(model, physics.mass)
     return model

@@ -12,6 +12,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, ModelError, instance
 from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import (
     SLIDE_SPEED,
     SPEED,
@@ -522,12 +523,7 @@ def described(robot: str | Path, hand: str | None = None) -> RobotDescription:
 
 def compiled(description: RobotDescription) -> mujoco.MjModel:
     """The described robot alone, as MuJoCo compiles it."""
-    try:
-        return description.spec().compile()
-    except ModelError:  # a ValueError too, and says more
-        raise
-    except ValueError as error:
-        raise InputError(f"{description.xml.name} does not compile: {error}") from error
+    return compiled_spec(description.spec(), f"{description.xml.name} does not compile")
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 
 from hqp_grasp.errors import HqpGraspError, InputError, ResultsError
 from hqp_grasp.grasp import as_array
+from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.objects import OBJECT, Body, Cylinder, Prism
 from hqp_grasp.world.robot import Robot, compiled, described
@@ -75,12 +76,8 @@ class Scene:
     @cached_property
     def model(self) -> mujoco.MjModel:
         """Robot and object, compiled."""
-        spec = self.spec()
-        try:
-            return spec.compile()
-        except ValueError as error:
-            name = self.__dict__["_description"].xml.name
-            raise InputError(f"{name} does not compile: {error}") from error
+        name = self.__dict__["_description"].xml.name
+        return compiled_spec(self.spec(), f"{name} does not compile")
 
     @cached_property
     def articulated(self) -> Robot:

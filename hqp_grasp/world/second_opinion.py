@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
+from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import ModelFile
 
 BODY = pin.FrameType.BODY  # a joint may be named like its body
@@ -27,7 +28,7 @@ class Agreement:
 def second_opinion(part: ModelFile) -> Agreement:
     """Compare bodies and their Jacobians in MuJoCo and Pinocchio, at random postures."""
     name = part.file.name
-    model = part.spec().compile()
+    model = compiled_spec(part.spec(), f"{name} does not compile")
     if not model.njnt:
         return Agreement(name, reason="nothing in it moves")
     if part.degrees is not None and not part.is_urdf:

@@ -408,6 +408,7 @@ REFUSALS = (
     lambda folder: written(folder, change(XML, "<equality>", f"<equality>{CONNECT}")),
     lambda folder: robot_of(claw(folder, '<mesh filename="tip.dae"/>')),
     lambda folder: robot_of(claw(folder, '<mesh filename="package://claw/tip.stl"/>')),
+    lambda folder: robot_of(claw(folder, '<mesh filename="tip.obj"/>')),
     lambda folder: written(folder, change(XML, ' angle="radian"', "")),
     lambda folder: written(folder, toml=SHORT.replace("contact_points", "contact_point")),
     lambda folder: written(folder, toml='lock = ["lft"]\n' + SHORT),
@@ -424,9 +425,10 @@ def test_the_docs_quote_every_refusal_in_its_own_words(tmp_path):
     table = page.partition("## When it is refused")[2].partition("## ")[0]
     quoted = re.findall(r"^\| `(.+?)` \|", table, re.MULTILINE)
     (tmp_path / "tip.dae").write_text("")
+    (tmp_path / "tip.obj").write_text("v 0 0 0\nv 0 0 1\nv 0 1 0\nv 1 0 0\n")
     told = []
     for refusal in REFUSALS:
-        with pytest.raises(ModelError) as error:
+        with pytest.raises((ModelError, InputError)) as error:
             refusal(tmp_path)
         told.append(str(error.value))
     assert len(quoted) == len(told)
