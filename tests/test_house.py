@@ -11,6 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "hqp_grasp"
 FLOORS = (
     ("errors",),
     ("grasp",),
+    ("mechanics",),
     ("history", "hierarchy", "world"),
     ("tasks",),
     ("control", "touch"),
