@@ -10,17 +10,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Protocol, runtime_checkable
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from hqp_grasp.errors import ResultsError, TrialError, WorkerError, flag, instance, whole
+from hqp_grasp.errors import InputError, ResultsError, TrialError, WorkerError, flag, whole
 from hqp_grasp.experiments.executor import DEATHS, address_of, run_all, tell
 from hqp_grasp.experiments.fingerprint import Fingerprint, cpu_kind, differences
 from hqp_grasp.experiments.parts import Parts
-from hqp_grasp.experiments.record import Record
-from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.world.scene import Scene
 
 STUDY_COLUMNS = {
     "trial": "number of the trial",
@@ -29,13 +29,42 @@ STUDY_COLUMNS = {
 }
 
 
+class Rows(Protocol):
+    """What one trial brings."""
+
+    def to_table(self) -> pa.Table:
+        """Its rows, with a column `error`: what ended it, null where nothing did."""
+        ...
+
+
+@runtime_checkable
+class Repeatable(Protocol):
+    """What a study repeats: a value such as a Trial, whose rows are a pure function of a seed."""
+
+    file: ClassVar[str]  # name of the file that all rows end in
+
+    @property
+    def scene(self) -> Scene:
+        """Where it takes place."""
+        ...
+
+    def attempt(self, seed: Sequence[int]) -> Rows:
+        """One trial; whatever ends it is told in its rows."""
+        ...
+
+    def nothing(self, seed: Sequence[int], error: str) -> Rows:
+        """The rows of a trial of which nothing is known but what ended it."""
+        ...
+
+
 @dataclass(frozen=True)
 class Study:
     """`trials` runs of one trial; trial i draws from SeedSequence([seed, i]).
 
     They run in `jobs` processes, or on the Dask `cluster` whose scheduler has this address, or
     wrote this file: workers return rows, this process writes them. DIR/parts/ holds finished
-    trials, each written whole or not at all; DIR/probes.parquet is all of them. DIR/config.json
+    trials, each written whole or not at all; DIR/probes.parquet, as `trial.file` says, is all
+    of them. DIR/config.json
     says what was run: a folder is continued with the same configuration and refused with another,
     or where parts of it cannot be compared (see Fingerprint). Raises ResultsError, before any work,
     for a folder that cannot be written or continued; WorkerError where the workers cannot do the
@@ -47,7 +76,7 @@ class Study:
     first one: what is done is on disk, then TrialError is raised.
     """
 
-    trial: Trial
+    trial: Repeatable
     trials: int = 40
     seed: int = 0
     jobs: int = 1
@@ -55,7 +84,10 @@ class Study:
     cluster: str | Path | None = None
 
     def __post_init__(self) -> None:
-        instance("Study.trial", self.trial, Trial)
+        if not isinstance(self.trial, Repeatable):
+            raise InputError(
+                f"Study.trial must be a Trial, or be repeated as one is; got {self.trial!r}"
+            )
         for name, least in (("trials", 1), ("seed", 0), ("jobs", 1)):
             object.__setattr__(self, name, whole(name, getattr(self, name), least))
         object.__setattr__(self, "strict", flag("strict", self.strict))
@@ -73,7 +105,7 @@ class Study:
         All their columns, or these: 100,000 trials of 40 probes hold 2 GB. DIR/probes.parquet keeps
         further trials too, where the folder has them.
         """
-        out, whole = Path(out), Path(out) / "probes.parquet"
+        out, whole = Path(out), Path(out) / self.trial.file
         with _claimed(out, self.configuration()) as folder:
             self.trial.scene.save(out / "scene.json")  # for whoever draws it
             parts = Parts(folder)
@@ -107,7 +139,7 @@ class Study:
                 ) from error
         return None
 
-    def _died(self, i: int) -> Record:
+    def _died(self, i: int) -> Rows:
         why = f"WorkerError: its process died each time, {DEATHS} times alone"
         return self.trial.nothing((self.seed, i), why)
 
@@ -116,25 +148,25 @@ class Study:
 class _Work:
     """What workers do."""
 
-    trial: Trial
+    trial: Repeatable
     seed: int
 
     def __call__(self, i: int) -> pa.Table:
         return _run_one(self.trial, self.seed, i)
 
 
-def _run_one(trial: Trial, seed: int, i: int) -> pa.Table:
+def _run_one(trial: Repeatable, seed: int, i: int) -> pa.Table:
     """The rows of trial i."""
     return _table(trial.attempt((seed, i)), i, seed)
 
 
-def _table(record: Record, trial: int, seed: int) -> pa.Table:
-    """The record's table, and which trial of the study it is."""
-    table = record.to_table()
+def _table(rows: Rows, trial: int, seed: int) -> pa.Table:
+    """The rows' table, and which trial of the study they are of."""
+    table = rows.to_table()
     for at, (name, value) in enumerate({"trial": trial, "seed": seed, "cpu": cpu_kind()}.items()):
         kind = pa.string() if isinstance(value, str) else pa.int64()
         about = pa.field(name, kind, metadata={"meaning": STUDY_COLUMNS[name]})
-        table = table.add_column(at, about, pa.array([value] * len(record.rows), kind))
+        table = table.add_column(at, about, pa.array([value] * len(table), kind))
     return table
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from operator import index
+from typing import ClassVar
 
 import numpy as np
 
@@ -46,6 +47,7 @@ class Trial:
     `start` draws the first touch, or is a grasp to begin from.
     """
 
+    file: ClassVar[str] = "probes.parquet"  # that a study of it ends in
     scene: Scene
     stack: Stack | Task
     probes: int = 60  # touches after the first
