@@ -158,14 +158,14 @@ def by_linear_programs(x, n, edges, outer):
         rims = pyramids(n, mu / np.cos(np.pi / edges) if outer else mu, edges)
         columns = np.concatenate([G[:, 3 * i : 3 * i + 3] @ rims[i].T for i in range(k)], axis=1)
         return (
-            0
-            == linprog(
+            linprog(
                 np.zeros(k * edges),
                 A_eq=np.vstack([columns, ones.sum(axis=0)]),
                 b_eq=np.append(np.zeros(6), k),
                 A_ub=-ones,
                 b_ub=np.full(k, -FLOOR),
             ).status
+            == 0
         )
 
     low, high = 0.0, 1.0
