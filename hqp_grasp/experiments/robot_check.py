@@ -25,6 +25,7 @@ def check(path: str | Path, hand: str | None = None, picture: str | Path | None 
     about = described(path, hand)
     robot = Robot(about, compiled(about))
     clearance = SelfClearance(robot, max(about.clearance, 1e-4))
+    out = about.left_out
     text = "\n".join(
         [
             f"{about.name}: {robot.n} independent joints, {robot.model.njnt} in all; hands: "
@@ -32,6 +33,8 @@ def check(path: str | Path, hand: str | None = None, picture: str | Path | None 
             *_files(about),
             "",
             *_joints(robot),
+            *([f"left out, of the files' equalities: {', '.join(out)}"] if out else []),
+            *_tendons(robot),
             "",
             *_contact_points(robot),
             "",
@@ -79,6 +82,50 @@ def _joints(robot: Robot) -> list[str]:
             f"{joint:{width}}  {ends:>16}  {robot.home[j]:7.2f}  {robot.velocity[j]:6.2f}  {role}"
         )
     return lines
+
+
+def _tendons(robot: Robot) -> list[str]:
+    """Tendons that bind joints by an actuator or limits, which is not read."""
+    model = robot.model
+    lines, together = [], []
+    for t in range(model.ntendon):
+        driven = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)) & (
+            model.actuator_trnid[:, 0] == t
+        )
+        acts = ["an actuator drives it"] if driven.any() else []
+        if model.tendon_limited[t]:
+            low, high = model.tendon_range[t]
+            acts.append(f"its length is limited to {low:.3g} … {high:.3g}")
+        if not acts:
+            continue
+        wraps = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+        fixed = (model.wrap_type[wraps] == int(mujoco.mjtWrap.mjWRAP_JOINT)).all()
+        joints = model.wrap_objid[wraps].tolist() if fixed else []
+        free = robot.coupling[joints].any(axis=0).sum()
+        if fixed and free < 2 and not model.tendon_limited[t]:
+            continue  # couplings say by now how its joints move together
+        names = [model.joint(j).name for j in joints]
+        over = ", ".join(names) or "sites, along a path in space"
+        lines.append(f"  {model.tendon(t).name or t} over {over}: {' and '.join(acts)}")
+        if free > 1:
+            together += [
+                f'{{ joint = "{name}", to = "{names[0]}", ratio = 1.0 }}' for name in names[1:]
+            ]
+    if not lines:
+        return []
+    told = [
+        "tendons that are not read: joints are taken as if nothing of this bound them. Where they",
+        "  move together couplings says so, where they are limited ranges does",
+        *lines,
+    ]
+    if together:
+        told += [
+            "  Were all their joints to turn alike, add",
+            f"couplings = [{', '.join(together)}]",
+        ]
+        if model.neq:
+            told += ["drop_couplings = []  # keeps the files' own equalities"]
+    return told
 
 
 def _contact_points(robot: Robot) -> list[str]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata, resources
 from importlib.util import find_spec
@@ -15,10 +16,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, ModelError, number, one_of, positive
+from hqp_grasp.errors import InputError, ModelError, one_of, positive
 from hqp_grasp.grasp import as_array
 from hqp_grasp.world.compiling import compiled_spec, read_afresh
 
+INF = math.inf
 SPEED, SLIDE_SPEED = 1.0, 0.25  # [rad/s], [m/s] of joints for which a description gives none
 CLEARANCE = 0.005  # [m] that links keep between them
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo loads
@@ -29,10 +31,12 @@ CCD_TOLERANCE, CCD_ITERATIONS = 1e-12, 200
 CARRIAGE = tuple(f"carriage_{axis}" for axis in ("x", "y", "z", "yaw", "pitch", "roll"))
 CARRIAGE_PITCH = np.radians(40.0)  # of the approach axis below the horizontal, at zero
 CARRIAGE_RANGES = ((-2.0, 2.0),) * 3 + ((-2.6, 2.6), (-1.4, 1.4), (-2.6, 2.6))  # [m], [rad]
+FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
+SIZES = {FREE: 7, BALL: 4}  # numbers that place a joint; others take one
 START = ("adduction", "elevation", "offset", "advance", "joints")  # of the drawn first postures
 KEYS = {  # of each table; a key that is none of these is refused
     "file": (
-        *("file", "prefix", "at", "pos", "quat", "rpy"),
+        *("file", "root", "prefix", "at", "pos", "quat", "rpy"),
         *("degrees", "balanceinertia", "fusestatic", "package_root"),
     ),
     "hand": ("name", "palm", "arm", "adduction", "contact_points"),
@@ -46,8 +50,8 @@ KEYS = {  # of each table; a key that is none of these is refused
     "start": START,
 }
 TOP = (
-    *("model", "description", "home", "speed", "velocity", "lock", "couplings", "drop_couplings"),
-    *("ranges", "carriage", "workspace", "clearance", "start", "hands"),
+    *("model", "root", "description", "home", "speed", "velocity", "lock", "couplings"),
+    *("drop_couplings", "ranges", "carriage", "workspace", "clearance", "start", "hands"),
     *KEYS["hand"][1:],
 )
 
@@ -65,6 +69,7 @@ class ModelFile:
     balanceinertia: bool | None = None  # None: only for a URDF
     fusestatic: bool | None = None  # None: never for a URDF, whose fixed links would melt away
     package_root: Path | None = None  # folder that package:// stands for; None: looked for
+    root: str = ""  # of its root bodies, the one that is the robot; "": all that the file holds
 
     @property
     def is_urdf(self) -> bool:
@@ -77,7 +82,36 @@ class ModelFile:
         return all(getattr(self, n) == getattr(plain, n) for n in ("prefix", "at", "pos", "quat"))
 
     def spec(self) -> mujoco.MjSpec:
-        """The file alone, as MuJoCo reads it."""
+        """The file alone, as MuJoCo reads it, every body and joint with a name."""
+        spec = self._whole()
+        if self.root:
+            roots = [body.name for body in spec.worldbody.bodies]
+            _known("root body", self.root, roots, f"root of {self.file.name}")
+            others = [body for body in spec.worldbody.bodies if body.name != self.root]
+            for thing in (*others, *spec.worldbody.geoms):
+                spec.delete(thing)  # and what refers to it
+        return spec
+
+    def keyframes(self) -> dict[str, dict[str, tuple[float, ...]]]:
+        """The coordinates of each joint in each keyframe [rad, m], by name.
+
+        A keyframe may list none: joints are then where the file puts them.
+        """
+        spec = self._whole()
+        ends = np.cumsum([SIZES.get(joint.type, 1) for joint in spec.joints]).tolist()
+        names = [joint.name for joint in spec.joints]
+        kept = {joint.name for joint in self.spec().joints} if self.root else set(names)
+        return {
+            key.name: {
+                self.prefix + name: tuple(np.array(key.qpos)[start:end].tolist())
+                for name, start, end in zip(names, [0, *ends], ends, strict=False)
+                if len(key.qpos) and name in kept
+            }
+            for key in spec.keys
+        }
+
+    def _whole(self) -> mujoco.MjSpec:
+        """All that the file holds."""
         read_afresh()
         try:
             if self.is_urdf:
@@ -90,6 +124,7 @@ class ModelFile:
                     spec.compiler.balanceinertia = self.balanceinertia
                 if self.fusestatic is not None:
                     spec.compiler.fusestatic = self.fusestatic
+            _name(spec)
         except ModelError:  # a ValueError too, and says more
             raise
         except (ValueError, ET.ParseError) as error:
@@ -102,14 +137,21 @@ class ModelFile:
             spec.compiler.degree = self.degrees
         elif not self.is_urdf and spec.compiler.degree:
             self._refuse_radians(spec)
-        # MuJoCo fills a keyframe that is too short with zeros, without a word.
-        for key in spec.keys:
-            if 0 < len(key.qpos) < len(spec.joints):
-                raise ModelError(
-                    f"keyframe {key.name!r} of {self.file.name} has {len(key.qpos)} angles; "
-                    f"the model has {len(spec.joints)} joints"
-                )
+        self._refuse_keyframes(spec)
         return spec
+
+    def _refuse_keyframes(self, spec: mujoco.MjSpec) -> None:
+        """Raise for keyframes that MuJoCo fills with zeros or passes on, without a word."""
+        size = sum(SIZES.get(joint.type, 1) for joint in spec.joints)
+        for key in spec.keys:
+            where = f"keyframe {key.name!r} of {self.file.name}"
+            if len(key.qpos) not in (0, size):
+                raise ModelError(
+                    f"{where} has {len(key.qpos)} numbers; the model's {len(spec.joints)} joints "
+                    f"take {size}"
+                )
+            if not np.isfinite(key.qpos).all():
+                raise ModelError(f"{where} has qpos {np.array(key.qpos)}, not all finite")
 
     def _refuse_radians(self, spec: mujoco.MjSpec) -> None:
         """Raise where a file that does not name its unit lists radians: MuJoCo takes degrees."""
@@ -224,7 +266,9 @@ class RobotDescription:
     files: tuple[ModelFile, ...]
     hands: tuple[Hand, ...]
     hand_name: str = ""  # the one that grasps; "": the first
-    home: str | Mapping[str, float] = field(default_factory=dict)  # keyframe, or joint: angle
+    home: Mapping[str, float] = field(default_factory=dict)  # [rad], of a table or a keyframe
+    bases: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    # (7,) of each free base in that keyframe: [m], w x y z
     speed: float | None = None  # [rad/s] of joints that `velocity` leaves out
     velocity: Mapping[str, float] = field(default_factory=dict)  # [rad/s]
     lock: tuple[str, ...] = ()  # joints that stay at home
@@ -241,7 +285,14 @@ class RobotDescription:
         """Read a robot of this package by name; any folder with a robot.toml, or file, by path."""
         path = _find(robot)
         try:
-            data = tomllib.loads(path.read_text(encoding="utf-8"))
+            data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        except UnicodeDecodeError as error:
+            raise ModelError(
+                f"{path} is not UTF-8, as TOML must be: byte {error.start} is "
+                f"0x{error.object[error.start]:02x}; save it in that encoding"
+            ) from error
+        except OSError as error:
+            raise ModelError(f"{path} cannot be read: {error.strerror}") from error
         except tomllib.TOMLDecodeError as error:
             raise ModelError(f"{path} is not valid TOML: {error}") from error
         try:
@@ -287,34 +338,35 @@ class RobotDescription:
 
     def spec(self) -> mujoco.MjSpec:
         """The described model, ready to be composed with others."""
-        spec = self._joined()
+        spec, fixed = self._joined()
         if self.carriage:
             self._put_on_carriage(spec)
-        self._change(spec)
+        self._change(spec, fixed)
         return spec
 
-    def _joined(self) -> mujoco.MjSpec:
-        """The files as one model."""
-        spec = self.files[0].spec()
-        spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
+    def _joined(self) -> tuple[mujoco.MjSpec, set[str]]:
+        """The files as one model, and the free bases that `lock` fixed in it."""
         if not self.files[0].stands_alone:
             raise ModelError(
                 f"{self.files[0].file.name} is the first file of {self.name}: pos, quat and prefix "
                 "are for those that are joined to it"
             )
-        if len(self.files) > 1:  # its keyframes would leave the other parts' joints at 0
-            for key in list(spec.keys):
-                spec.delete(key)
+        spec, fixed = self._part(self.files[0])
         for part in self.files[1:]:
             if not part.prefix:
                 raise ModelError(
                     f"{part.file.name} is joined to other files and needs a prefix before its "
                     'names, such as prefix = "hand_"'
                 )
-            child = part.spec()
-            child.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
-            for key in list(child.keys):
-                child.delete(key)
+            child, more = self._part(part)
+            fixed |= more
+            loose = next((j for j in child.joints if j.type == FREE), None)
+            if part.at and loose is not None:
+                name = part.prefix + loose.name
+                raise ModelError(
+                    f"{part.file.name} has a free base {name!r}, which {part.at!r} cannot carry: "
+                    f'lock = ["{name}"] fixes it'
+                )
             body = spec.body(part.at) if part.at else spec.worldbody
             if body is None:
                 _known("body", part.at, [b.name for b in spec.bodies], f"at of {part.file.name}")
@@ -323,21 +375,51 @@ class RobotDescription:
                 spec.attach(child, prefix=part.prefix, frame=frame)
             except ValueError as error:
                 raise ModelError(f"{part.file.name} cannot be joined: {error}") from error
-        return spec
+        return spec, fixed
+
+    def _part(self, part: ModelFile) -> tuple[mujoco.MjSpec, set[str]]:
+        """One of the files, without keyframes, and the free bases that `lock` fixed in it."""
+        spec, fixed = part.spec(), set()
+        spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
+        for body in spec.worldbody.bodies:
+            for joint in body.joints:
+                name = part.prefix + joint.name
+                if joint.type == FREE and name in self.lock:
+                    if name in self.bases:
+                        _place(spec, body, self.bases[name][:3], self.bases[name][3:])
+                    spec.delete(joint)
+                    fixed.add(name)
+        # They are read by now, joint by joint; in a larger model they would list others' angles.
+        for key in list(spec.keys):
+            spec.delete(key)
+        return spec, fixed
 
     def _put_on_carriage(self, spec: mujoco.MjSpec) -> None:
         """Six joints at the root: at zero the palm is held as a drawn start holds it."""
         palm, roots = self.hand.palm, spec.worldbody.bodies
         if palm is None:
             raise ModelError(f"{self.name}: a carriage needs a palm to hold the hand by")
-        if len(roots) != 1 or roots[0].joints or spec.worldbody.geoms:
-            raise ModelError(f"{self.name}: a carriage carries one root body without joints")
+        if len(roots) != 1 or spec.worldbody.geoms:
+            beside = " and geoms of the world" if spec.worldbody.geoms else ""
+            raise ModelError(
+                f"{self.name}: a carriage carries one root body; the model has "
+                f"{', '.join(repr(body.name) for body in roots) or 'none'}{beside}; "
+                'root = "BODY" takes that one alone'
+            )
+        if roots[0].joints:
+            joint = roots[0].joints[0]
+            free = joint.type == FREE
+            mend = f'lock = ["{joint.name}"] fixes it' if free else "give it a body of its own"
+            raise ModelError(
+                f"{self.name}: a carriage carries a root body without joints; joint "
+                f"{joint.name!r} moves {roots[0].name!r}: {mend}"
+            )
         alone = replace(self, carriage=False).spec()
         model = compiled_spec(alone, f"{self.xml.name} does not compile")
         data = mujoco.MjData(model)
-        for joint, angle in self.home_angles(alone).items():
-            if joint not in CARRIAGE:
-                data.joint(joint).qpos[0] = angle
+        for name, angle in self.home.items():
+            if name not in CARRIAGE:
+                data.joint(name).qpos[0] = angle
         mujoco.mj_kinematics(model, data)
         z = np.array([np.cos(CARRIAGE_PITCH), 0.0, -np.sin(CARRIAGE_PITCH)])
         y = np.array([0.0, 1.0, 0.0])
@@ -348,7 +430,7 @@ class RobotDescription:
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, R_root.ravel())
         to_palm = turn @ (data.site(self.palm).xpos - data.xpos[root])
-        roots[0].pos, roots[0].quat = -to_palm, quat
+        _place(spec, roots[0], -to_palm, quat)
         axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
         for name, axis, ends in zip(CARRIAGE, axes, CARRIAGE_RANGES, strict=True):
             slides = name[-2:] in ("_x", "_y", "_z")
@@ -367,8 +449,8 @@ class RobotDescription:
             if joint.type != mujoco.mjtJoint.mjJNT_SLIDE and spec.compiler.degree
         }
 
-    def _change(self, spec: mujoco.MjSpec) -> None:
-        """Do to the model what the description asks for."""
+    def _change(self, spec: mujoco.MjSpec, fixed: set[str]) -> None:
+        """Do to the model what the description asks for; `fixed` bases are so already."""
         joints = {joint.name: joint for joint in spec.joints}
         units = self._units() if self.ranges or self.couplings or self.lock else {}
         refs = {name: joint.ref * units.get(name, 1.0) for name, joint in joints.items()}
@@ -384,22 +466,32 @@ class RobotDescription:
                     f"{', '.join(known) or 'none'}"
                 )
         for equality in list(spec.equalities):
-            drop = self.drop_couplings
-            if drop is True or (drop and {equality.name, equality.name1} & set(drop)):
+            if self._drops(equality):
                 spec.delete(equality)
         for coupling in self.couplings:
             one = joints[self._joint(coupling.joint, joints, "couplings")]
             other = joints[self._joint(coupling.to, joints, "couplings")]
             rest = coupling.offset + coupling.ratio * refs[other.name] - refs[one.name]
             _couple(spec, one.name, other.name, rest, coupling.ratio)
-        home = self.home_angles(spec)
-        for name in (*self.lock, *home):
-            self._joint(name, joints, "lock" if name in self.lock else "home")
+        for name in self.home:
+            self._joint(name, joints, "home")
+            if joints[name].type in SIZES:
+                raise ModelError(
+                    f"home of {self.name}: {name!r} is neither hinge nor slide, which one number "
+                    "would place"
+                )
         for name in self.lock:
-            if joints[name].type == mujoco.mjtJoint.mjJNT_FREE:
-                spec.delete(joints[name])
+            if name in fixed:
                 continue
-            _couple(spec, name, "", home.get(name, refs[name]) - refs[name], 0.0)
+            joint, unit = joints[self._joint(name, joints, "lock")], units.get(name, 1.0)
+            if joint.type in SIZES:
+                raise ModelError(
+                    f"lock of {self.name}: {name!r} is neither hinge, slide nor free base; leave "
+                    "it out of the file"
+                )
+            low, high = np.array(joint.range) * unit if _limited(spec, joint) else (-INF, INF)
+            angle = self.home.get(name, min(max(refs[name], low), high))
+            _couple(spec, name, "", angle - refs[name], 0.0)
         for body in spec.bodies:
             for i, geom in enumerate(body.geoms):
                 if not geom.name and (geom.contype or geom.conaffinity):
@@ -428,21 +520,58 @@ class RobotDescription:
                         mass=0.0,
                     )
 
-    def home_angles(self, spec: mujoco.MjSpec) -> Mapping[str, float]:
-        """Angle of each joint at home that the description gives, or its keyframe [rad]."""
-        if not isinstance(self.home, str):
-            return self.home
-        key = next((key for key in spec.keys if key.name == self.home), None)
-        if key is None:
-            names = ", ".join(k.name for k in spec.keys if k.name)
-            raise ModelError(
-                f"no keyframe {self.home!r} in {self.xml.name} of {self.name}; "
-                f"keyframes are: {names or 'none'}"
-            )
-        return dict(zip((j.name for j in spec.joints), key.qpos, strict=False))
+    def _drops(self, equality: mujoco.MjsEquality) -> bool:
+        if isinstance(self.drop_couplings, bool):
+            return self.drop_couplings
+        return not {equality.name, equality.name1}.isdisjoint(self.drop_couplings)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The files' equalities that `couplings` replaces or `drop_couplings` names."""
+        spec, _ = self._joined()
+        return tuple(e.name or e.name1 for e in spec.equalities if self._drops(e))
 
     def _joint(self, name: str, joints: Mapping[str, object], where: str) -> str:
         return _known("joint", name, joints, f"{where} of {self.name}")
+
+
+def _name(spec: mujoco.MjSpec) -> None:
+    """Call bodies and joints without a name after the body that carries them."""
+    # Where a file is not UTF-8, reading the names of geoms and sites says so, here and not later.
+    named = {thing.name for thing in (*spec.bodies, *spec.joints, *spec.geoms, *spec.sites)}
+
+    def new(stem: str, things: Sequence[Any]) -> None:
+        for i, thing in enumerate(things):
+            if not thing.name:
+                name = stem if len(things) == 1 else f"{stem}_{i + 1}"
+                while name in named:
+                    name += "_"
+                thing.name = name
+                named.add(name)
+
+    for body in spec.bodies:  # those that carry come first
+        new(f"{body.name}_joint", body.joints)
+        new(f"{body.name}_body", body.bodies)
+
+
+def _place(
+    spec: mujoco.MjSpec,
+    root: mujoco.MjsBody,
+    pos: Sequence[float] | np.ndarray,
+    quat: Sequence[float] | np.ndarray,
+) -> None:
+    """Put a root body at `pos` (3,) [m] and `quat`, world, whatever the file places it by."""
+    root.pos, root.quat = pos, quat
+    root.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT  # else Euler angles go first
+    if root.frame is not None:
+        root.set_frame(spec.worldbody.add_frame())
+
+
+def _limited(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> bool:
+    """Whether MuJoCo will keep the joint within its range."""
+    if joint.limited == mujoco.mjtLimited.mjLIMITED_AUTO:
+        return bool(spec.compiler.autolimits and joint.range[0] < joint.range[1])
+    return bool(joint.limited == mujoco.mjtLimited.mjLIMITED_TRUE)
 
 
 def _angle_unit(spec: mujoco.MjSpec) -> float:
@@ -505,6 +634,10 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
     folder = path.parent
     model = data["model"]
     parts = model if isinstance(model, list) else [model]
+    if "root" in data:
+        if not isinstance(model, str):
+            raise InputError("root belongs into [[model]], beside the file whose body it names")
+        parts = [{"file": model, "root": data["root"]}]
     if "hands" in data:
         mixed = [key for key in KEYS["hand"] if key in data]
         if mixed:
@@ -514,14 +647,19 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         hands = (_hand({"name": "hand", **{k: data[k] for k in KEYS["hand"] if k in data}}),)
     if not hands:
         raise InputError("hands is empty")
-    home = data.get("home", {})
-    drop = data.get("drop_couplings", [])
+    files = tuple(_file(part, folder) for part in parts)
+    home, bases = data.get("home"), dict[str, tuple[float, ...]]()
+    if home is None or isinstance(home, str):
+        home, bases = _keyframe(folder, files, home)
+    # Couplings that are said replace the file's, all or those that drop_couplings names.
+    drop = data.get("drop_couplings", "couplings" in data)
     workspace = data.get("workspace")
     return RobotDescription(
         name=folder.resolve().name if path.name == "robot.toml" else path.stem,
-        files=tuple(_file(part, folder) for part in parts),
+        files=files,
         hands=hands,
-        home=home if isinstance(home, str) else _numbers("home", home),
+        home=_numbers("home", home),
+        bases=bases,
         speed=positive("speed", data["speed"]) if "speed" in data else None,
         velocity={j: positive(f"velocity of {j}", v) for j, v in data.get("velocity", {}).items()},
         lock=_texts(data.get("lock", [])),
@@ -530,9 +668,28 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         ranges={j: _range(f"ranges of {j}", v) for j, v in data.get("ranges", {}).items()},
         carriage=_flag("carriage", data.get("carriage", False)),
         workspace=None if workspace is None else _vector("workspace", workspace),
-        clearance=number("clearance", data.get("clearance", CLEARANCE)),
+        clearance=_clearance(data.get("clearance", CLEARANCE)),
         start=_start(data.get("start", {})),
     )
+
+
+def _keyframe(
+    folder: Path, files: tuple[ModelFile, ...], name: str | None
+) -> tuple[dict[str, float], dict[str, tuple[float, ...]]]:
+    """Angles [rad, m] and free bases in the keyframe of that name, without a name in "home".
+
+    Each file's keyframe says where its own joints are.
+    """
+    read = [part.keyframes() for part in files]
+    known = [key for keys in read for key in keys if key]
+    if name is not None and name not in known:
+        raise ModelError(
+            f"no keyframe {name!r} in {', '.join(p.file.name for p in files)} of "
+            f"{folder.resolve().name}; keyframes are: {', '.join(dict.fromkeys(known)) or 'none'}"
+        )
+    found = [item for keys in read for item in keys.get(name or "home", {}).items()]
+    angles = {joint: at[0] for joint, at in found if len(at) == 1}
+    return angles, {joint: at for joint, at in found if len(at) == SIZES[FREE]}
 
 
 def _file(part: object, folder: Path) -> ModelFile:
@@ -557,6 +714,7 @@ def _file(part: object, folder: Path) -> ModelFile:
         tuple(quat.tolist()),
         **{flag: _flag(flag, part[flag]) for flag in flags if flag in part},
         package_root=folder / _text(part["package_root"]) if "package_root" in part else None,
+        root=_text(part.get("root", "")),
     )
 
 
@@ -636,7 +794,7 @@ def _coupling(data: object) -> Coupling:
         raise InputError(f"couplings must be tables; got {data!r}")
     _check(data, KEYS["coupling"], "couplings")
     ratio, offset = (
-        number(f"couplings.{k}", data.get(k, default))
+        _number(f"couplings.{k}", data.get(k, default))
         for k, default in (("ratio", 1.0), ("offset", 0.0))
     )
     return Coupling(_text(data["joint"]), _text(data["to"]), ratio, offset)
@@ -650,7 +808,7 @@ def _start(data: object) -> Mapping[str, Any]:
     start: dict[str, Any] = {}
     for key, value in data.items():
         if key in ("advance", "joints"):
-            start[key] = number(f"start.{key}", value)
+            start[key] = _number(f"start.{key}", value)
         else:
             low, high = _range(f"start.{key}", value)
             turn = 1.0 if key == "offset" else np.pi / 180.0
@@ -718,4 +876,18 @@ def _range(name: str, value: object) -> tuple[float, float]:
 
 
 def _numbers(name: str, value: Mapping[str, object]) -> dict[str, float]:
-    return {key: number(f"{name} of {key}", v) for key, v in value.items()}
+    return {key: _number(f"{name} of {key}", v) for key, v in value.items()}
+
+
+def _number(name: str, value: object) -> float:
+    """A finite number, as TOML writes it."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} must be a finite number; got {value!r}")
+    return float(value)
+
+
+def _clearance(value: object) -> float:
+    clearance = _number("clearance", value)
+    if clearance < 0.0:
+        raise InputError(f"clearance must be 0 or more [m]; got {value!r}")
+    return clearance

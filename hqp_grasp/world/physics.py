@@ -112,7 +112,8 @@ def round_tips(robot: Robot) -> list[str]:
         if radius == 0.0 or not point.site:
             raise InputError(
                 f"the simulated hand feels with round tips that have a site at their centre; "
-                f"{point.name} of {robot.description.name} has none"
+                f"{point.name} of {robot.description.name} has none; an MJCF can have them, and "
+                "servos. A URDF cannot: it is probed geometrically"
             )
     return [robot.model.geom(geoms[0]).name for geoms in robot.geoms]
 

@@ -28,12 +28,26 @@ CONVEX = [SPHERE, CAPSULE] + [
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
     for kind in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")
 ]
+LINKS = {  # equalities of two links, and what they do
+    int(mujoco.mjtEq.mjEQ_CONNECT): "closes a loop of links",
+    int(mujoco.mjtEq.mjEQ_WELD): "welds two links",
+}
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 PARALLEL = 0.7  # [–] cosine of two joint axes that bend a finger alike
 SLIDE_UNIT = 0.06  # [m] a slide closes by while a hinge closes by 1 rad
 UNLIMITED = 1.0  # [rad] a joint without range opens and closes by from where it is
+HELD = 1e-9  # [rad] rounding, of a joint that is held at the end of its range
 CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
+
+
+_BALL_JOINT = "three hinges turn as a ball does"
+MEASURES = {  # of a compiled model, which MuJoCo takes as they are, numbers or not
+    "body": ("pos", "quat", "mass", "inertia"),
+    "jnt": ("pos", "axis", "range"),
+    "geom": ("pos", "quat", "size"),
+    "site": ("pos", "quat"),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,11 +93,14 @@ class Robot:
         instance("Robot.model", model, mujoco.MjModel)
         for j in range(model.njnt):
             if model.jnt_type[j] not in (HINGE, SLIDE):
+                name = model.joint(j).name
+                free = model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_FREE)
                 raise ModelError(
-                    f"joint {model.joint(j).name!r} of {about.name} is neither hinge nor slide; "
+                    f"joint {name!r} of {about.name} is neither hinge nor slide; "
                     "a robot here has a fixed base and one-dimensional joints: "
-                    f'lock = ["{model.joint(j).name}"] fixes a free base'
+                    + (f'lock = ["{name}"] fixes a free base' if free else _BALL_JOINT)
                 )
+        _refuse_no_numbers(model, about)
         put("_local", threading.local())
         put("_hinge", model.jnt_type == HINGE)
         # Joints are numbered from the base outwards, so the smaller number is nearer the base.
@@ -160,14 +177,8 @@ class Robot:
 
     def _home(self, independent: list[int]) -> np.ndarray:
         model, about = self.model, self.description
-        name = about.home
-        if not name and any(model.key(i).name == "home" for i in range(model.nkey)):
-            name = "home"
-        if isinstance(name, str):
-            key = _id(model, mujoco.mjtObj.mjOBJ_KEY, name, "keyframe", about)
-            return model.key_qpos[key][independent].copy()
         home = np.clip(model.qpos0[independent], self.q_lower, self.q_upper)
-        for joint, angle in name.items():
+        for joint, angle in about.home.items():
             if joint in self.joints:  # the others follow
                 home[self.index(joint)] = angle
         outside = (home < self.q_lower) | (home > self.q_upper)
@@ -176,6 +187,16 @@ class Robot:
             raise ModelError(
                 f"home of {about.name} puts {self.joints[j]!r} at {home[j]:g}, outside its range "
                 f"[{self.q_lower[j]:g}, {self.q_upper[j]:g}]"
+            )
+        held = ~self.coupling.any(axis=1) & (
+            (self.offset < self.lower - HELD) | (self.offset > self.upper + HELD)
+        )
+        if held.any():
+            j = int(held.argmax())
+            raise ModelError(
+                f"joint {model.joint(j).name!r} of {about.name} is held at {self.offset[j]:g}, "
+                f"outside its range [{self.lower[j]:g}, {self.upper[j]:g}]; lock and home, or the "
+                "file's equality, hold it there"
             )
         return home
 
@@ -507,6 +528,19 @@ def _id(
     return i
 
 
+def _refuse_no_numbers(model: mujoco.MjModel, about: RobotDescription) -> None:
+    """Raise where the file says NaN, which compares false and so passes every other check."""
+    for kind, names in MEASURES.items():
+        for name in names:
+            values = getattr(model, f"{kind}_{name}")
+            for i in np.argwhere(np.isnan(values))[:1, 0].tolist():
+                word = "joint" if kind == "jnt" else kind
+                raise ModelError(
+                    f"{word} {getattr(model, word)(i).name!r} of {about.name} has {name} "
+                    f"{values[i]}: its file must say numbers"
+                )
+
+
 def described(robot: str | Path, hand: str | None = None) -> RobotDescription:
     """A robot's description; where a carriage has no palm to hold it by, with the one found."""
     about = RobotDescription.load(robot, hand)
@@ -652,22 +686,33 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
         if not model.eq_active0[e]:
             continue
         kind, coefficients = model.eq_type[e], model.eq_data[e]
-        if kind == int(mujoco.mjtEq.mjEQ_CONNECT):
-            raise ModelError(
-                f"equality {model.eq(e).name or e} closes a loop of links, whose joints no law "
-                "here knows to be bound: drop_couplings = true leaves it out, and "
-                "couplings = [{ joint, to, ratio }] says how they move together"
-            )
+        name = model.eq(e).name or f"{e}"
         side: Callable[[mujoco.MjModel, int], tuple[np.ndarray, float]]
         if kind == int(mujoco.mjtEq.mjEQ_JOINT):
             side = _joint_row
         elif kind == int(mujoco.mjtEq.mjEQ_TENDON):
             side = _tendon_row
-        else:
+        elif kind in LINKS:
+            bound = _between(model, e)
+            if bound:
+                raise ModelError(
+                    f"equality {name} {LINKS[kind]}, whose joints no law here knows to be bound: "
+                    "drop_couplings = true leaves it out, and "
+                    "couplings = [{ joint, to, ratio }] says how they move together"
+                )
             continue
+        else:
+            raise ModelError(
+                f"equality {name} binds neither joints nor links, and no law here knows what "
+                f'it does: drop_couplings = ["{name}"] leaves it out'
+            )
+        if not np.isfinite(coefficients[:5]).all():
+            raise ModelError(f"equality {name} has polycoef {coefficients[:5]}, not all finite")
         if np.any(coefficients[2:5] != 0.0):
-            raise ModelError(f"equality {model.eq(e).name or e} is not linear; couplings must be")
+            raise ModelError(f"equality {name} is not linear; couplings must be")
         row, at_zero = side(model, int(model.eq_obj1id[e]))
+        if not row.any():
+            raise ModelError(f"equality {name} is of a tendon that no joint moves")
         dependent.append(int(np.flatnonzero(row)[-1]))
         value = at_zero + coefficients[0]
         if model.eq_obj2id[e] >= 0:
@@ -685,10 +730,23 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
         try:
             inverse = np.linalg.inv(E[:, dependent])
         except np.linalg.LinAlgError as error:
-            raise ModelError("the model's couplings contradict or repeat one another") from error
+            names = [repr(model.joint(j).name) for j in sorted(set(dependent))]
+            raise ModelError(
+                "the model's couplings contradict or repeat one another; they bind "
+                + ", ".join(names)
+            ) from error
         C[dependent] = -inverse @ E[:, independent]
         c0[dependent] = inverse @ e0
     return C, c0, independent
+
+
+def _between(model: mujoco.MjModel, e: int) -> set[int]:
+    """The joints between the two links that an equality binds."""
+    ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+    if model.eq_objtype[e] == int(mujoco.mjtObj.mjOBJ_SITE):
+        ends = [int(model.site_bodyid[site]) for site in ends]
+    one, other = (set(_chain(model, body)) for body in ends)
+    return one ^ other
 
 
 def _joint_row(model: mujoco.MjModel, j: int) -> tuple[np.ndarray, float]:

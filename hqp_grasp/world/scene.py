@@ -64,9 +64,16 @@ class Scene:
         description: RobotDescription = self.__dict__["_description"]
         spec = description.spec()
         try:
-            frame = spec.worldbody.add_frame(pos=self.base[:3], quat=self.base[3:])
-            for root in spec.worldbody.bodies:
-                root.set_frame(frame)
+            world = spec.worldbody
+            # What stands in a frame of its file keeps its place in it.
+            loose = [
+                thing
+                for thing in (*world.bodies, *world.frames, *world.geoms, *world.sites)
+                if thing.frame is None
+            ]
+            frame = world.add_frame(pos=self.base[:3], quat=self.base[3:])
+            for thing in loose:
+                thing.set_frame(frame)
             body = spec.worldbody.add_body(name=OBJECT, pos=self.position)
             self.object.add_geoms(spec, body)
         except ValueError as error:

@@ -31,6 +31,10 @@ def second_opinion(part: ModelFile) -> Agreement:
     model = compiled_spec(part.spec(), f"{name} does not compile")
     if not model.njnt:
         return Agreement(name, reason="nothing in it moves")
+    if model.nq != model.njnt:
+        return Agreement(name, reason="not compared: a joint is neither hinge nor slide")
+    if part.root:
+        return Agreement(name, reason="not compared: Pinocchio reads all of its root bodies")
     if part.degrees is not None and not part.is_urdf:
         return Agreement(name, reason="not compared: Pinocchio reads its angles as the file says")
     build = pin.buildModelFromUrdf if part.is_urdf else pin.buildModelFromMJCF

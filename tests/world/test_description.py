@@ -9,6 +9,7 @@ import pytest
 import tiny_hand
 from tiny_hand import XML, change
 
+import hqp_grasp as hg
 from hqp_grasp.errors import InputError, ModelError
 from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.grasp import Grasp
@@ -16,7 +17,7 @@ from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.description import CCD_TOLERANCE, RobotDescription, locate
 from hqp_grasp.world.objects import Cylinder
-from hqp_grasp.world.robot import Robot, compiled
+from hqp_grasp.world.robot import Robot, compiled, described
 from hqp_grasp.world.scene import Scene
 from hqp_grasp.world.second_opinion import second_opinion
 
@@ -49,7 +50,7 @@ def claw(folder, shape=BALL, toml=""):
 
 
 def robot_of(path, **given):
-    about = RobotDescription.load(path, **given)
+    about = described(path, **given)
     return Robot(about, compiled(about))
 
 
@@ -249,6 +250,485 @@ def test_the_torsos_shoulders_are_where_the_public_layout_has_them():
     assert SelfClearance(robot, 0.005).collisions(robot.home) == ()
 
 
+# ---------------------------------------------------------------- keyframes, free bases, roots
+
+SIX = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+NO_KEYS = XML[: XML.index("  <keyframe>")] + "</mujoco>"
+LIFT = '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>'
+FREE = change(NO_KEYS, LIFT, '<freejoint name="root"/>')
+BASED = 'palm = { body = "palm", approach = [1, 0, 0], opposition = [0, 1, 0] }\n'
+
+
+def six(free="", qpos=SIX, inside="", names=True):
+    """A hand of two fingers with three joints each, and a keyframe of its joints."""
+    finger = """<body name="{f}1" pos="{x} 0 0"><joint {a} axis="0 {s} 0" range="-1 2"/>
+        <geom type="capsule" size="0.01" fromto="0 0 0 0 0 0.04"/>
+        <body name="{f}2" pos="0 0 0.05"><joint {b} axis="0 {s} 0" range="-1 2"/>
+        <geom type="capsule" size="0.01" fromto="0 0 0 0 0 0.04"/>
+        <body name="{f}3" pos="0 0 0.05"><joint {c} axis="0 {s} 0" range="-1 2"/>
+        <geom type="sphere" size="0.01" pos="0 0 0.03"/></body></body></body>"""
+    fingers = "".join(
+        finger.format(
+            f=f, x=x, s=s, **{k: f'name="{f}{k}"' if names else "" for k in ("a", "b", "c")}
+        )
+        for f, x, s in (("l", -0.06, 1), ("r", 0.06, -1))
+    )
+    key = f'<key name="home" qpos="{" ".join(map(str, qpos))}"/>' if len(qpos) else ""
+    return (
+        f'<mujoco model="six"><compiler angle="radian"/><worldbody><body name="palm">{free}'
+        f'<geom size="0.02"/>{fingers}</body>{inside}</worldbody><keyframe>{key}</keyframe>'
+        "</mujoco>"
+    )
+
+
+TIPS = '[[contact_points]]\nlink = "l3"\n[[contact_points]]\nlink = "r3"\n'
+SIX_HAND = 'model = "tiny.xml"\n{}\n' + TIPS
+SIX_PALM = 'palm = { body = "palm", approach = [0, 0, 1], opposition = [1, 0, 0] }\n'
+
+
+@pytest.mark.parametrize("named", ["", 'home = "home"\n'])
+def test_a_keyframe_on_a_carriage_is_the_fingers_and_not_the_carriages(tmp_path, named):
+    toml = SIX_HAND.format(named + "carriage = true")
+    robot = written(tmp_path, six(), toml)
+    np.testing.assert_array_equal(robot.home, [0.0] * 6 + SIX)
+    np.testing.assert_array_equal(Scene(tmp_path).articulated.home, robot.home)
+
+
+def test_each_files_keyframe_places_its_own_joints(tmp_path):
+    """The arm's file has another keyframe of that name, and its own order."""
+    (tmp_path / "arm.xml").write_text(change(XML, 'qpos="0 0.2 0.1"', 'qpos="0.3 0.4 0.2"'))
+    toml = """
+        home = "{}"
+        [[model]]
+        file = "arm.xml"
+        [[model]]
+        file = "tiny.xml"
+        prefix = "hand_"
+        at = "distal"
+        [[contact_points]]
+        link = "hand_l3"
+        [[contact_points]]
+        link = "hand_r3"
+    """
+    robot = written(tmp_path, six(), toml.format("home"))
+    np.testing.assert_array_equal(robot.home, [0.3, 0.4, *SIX])
+    only = change(six(), 'key name="home"', 'key name="open"')
+    np.testing.assert_array_equal(written(tmp_path, only, toml.format("open")).home, [0, 0, *SIX])
+    refused(
+        lambda: written(tmp_path, only, toml.format("shut")),
+        "no keyframe 'shut' in arm.xml, tiny.xml", "keyframes are: home, open",
+    )  # fmt: skip
+
+
+def test_of_several_keyframes_the_named_one_counts(tmp_path):
+    keys = '<key qpos="1 1 1 1 1 1"/><key name="shut" qpos="0 0 0 1 1 1"/></keyframe>'
+    xml = six().replace("</keyframe>", keys)
+    np.testing.assert_array_equal(written(tmp_path, xml, SIX_HAND.format("")).home, SIX)
+    shut = written(tmp_path, xml, SIX_HAND.format('home = "shut"'))
+    np.testing.assert_array_equal(shut.home, [0, 0, 0, 1, 1, 1])
+    # a table stands alone: joints it leaves out are at zero
+    table = written(tmp_path, xml, SIX_HAND.format("home = { rb = 0.5 }"))
+    np.testing.assert_array_equal(table.home, [0, 0, 0, 0, 0.5, 0])
+
+
+def test_a_keyframe_without_angles_leaves_the_joints_where_they_are(tmp_path):
+    xml = change(six(qpos=()), "<keyframe>", '<keyframe><key name="home" time="1"/>')
+    np.testing.assert_array_equal(written(tmp_path, xml, SIX_HAND.format("")).home, np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("qpos", "words"),
+    [
+        ([0.1, 0.2, 0.3, 0.4, 0.5, 2.5], ("home", "'rc' at 2.5", "outside its range [-1, 2]")),
+        ([0.1, 0.2, 0.3, 0.4, 0.5, "nan"], ("keyframe 'home'", "not all finite")),
+        ([0.1, 0.2, 0.3, 0.4, 0.5, "inf"], ("keyframe 'home'", "not all finite")),
+        ([0.1], ("keyframe 'home'", "has 1 numbers", "6 joints take 6")),
+        ([0.1] * 7, ("keyframe 'home'", "has 7 numbers", "6 joints take 6")),
+    ],
+)
+@pytest.mark.parametrize("carriage", ["", "carriage = true\n"])
+def test_a_keyframe_that_cannot_be_is_refused(tmp_path, monkeypatch, qpos, words, carriage):
+    monkeypatch.chdir(tmp_path)  # MuJoCo keeps a log of the NaNs it warns of
+    refused(lambda: written(tmp_path, six(qpos=qpos), SIX_HAND.format(carriage)), *words)
+
+
+def test_a_free_base_with_lock_keyframe_and_carriage_works(tmp_path):
+    based = [0.5, 0.0, 0.2, 0.0, 1.0, 0.0, 0.0, *SIX]
+    free = six('<freejoint name="root"/>', based)
+    locked = written(tmp_path, free, SIX_HAND.format('lock = ["root"]\n' + SIX_PALM))
+    np.testing.assert_array_equal(locked.home, SIX)
+    p, R = locked.palm(locked.home)  # where the keyframe holds the base, upside down
+    np.testing.assert_allclose(p, [0.5, 0, 0.2], atol=EXACT)
+    np.testing.assert_allclose(R, np.diag([1.0, -1.0, -1.0]), atol=EXACT)
+    toml = SIX_HAND.format('carriage = true\nlock = ["root"]\n' + SIX_PALM)
+    carried = written(tmp_path, free, toml)
+    np.testing.assert_array_equal(carried.home, [0.0] * 6 + SIX)
+    fixed = SIX_HAND.format("carriage = true\n" + SIX_PALM)
+    same = written(tmp_path, six(), fixed)
+    np.testing.assert_allclose(carried.centers(carried.home), same.centers(same.home), atol=1e-9)
+    # each way that is closed names the one that is open
+    refused(lambda: written(tmp_path, free, fixed), "'root' moves 'palm'", 'lock = ["root"]')
+    refused(lambda: written(tmp_path, free, SIX_HAND.format("")), 'lock = ["root"]')
+    unnamed = six("<freejoint/>", based)
+    refused(lambda: written(tmp_path, unnamed, SIX_HAND.format("")), 'lock = ["palm_joint"]')
+    toml = SIX_HAND.format('carriage = true\nlock = ["palm_joint"]\n' + SIX_PALM)
+    np.testing.assert_array_equal(written(tmp_path, unnamed, toml).home, carried.home)
+
+
+def test_a_free_base_is_fixed_where_its_file_is_joined(tmp_path):
+    (tmp_path / "arm.xml").write_text(XML)
+    toml = """
+        {}
+        [[model]]
+        file = "arm.xml"
+        [[model]]
+        file = "tiny.xml"
+        prefix = "hand_"
+        at = "distal"
+        [[contact_points]]
+        link = "hand_l3"
+        [[contact_points]]
+        link = "hand_r3"
+    """
+    free = six('<freejoint name="root"/>', [0, 0, 0.1, 1, 0, 0, 0, *SIX])
+    robot = written(tmp_path, free, toml.format('lock = ["hand_root"]'))
+    np.testing.assert_array_equal(robot.home, [0, 0.2, *SIX])
+    at = robot.model.body("hand_palm").pos
+    np.testing.assert_allclose(at, [0, 0, 0.1], atol=EXACT)
+    refused(
+        lambda: written(tmp_path, free, toml.format("")),
+        "free base 'hand_root'", "'distal' cannot carry", 'lock = ["hand_root"]',
+    )  # fmt: skip
+
+
+def test_the_check_takes_a_free_base(tmp_path):
+    tiny_hand.write(
+        tmp_path, six('<freejoint name="root"/>', []), SIX_HAND.format('lock = ["root"]')
+    )
+    assert "tiny.xml: not compared: a joint is neither hinge nor slide" in check(tmp_path)
+
+
+OTHERS = (
+    '<body name="table" pos="0 0 -0.5"><geom name="top" type="box" size="1 1 .1"/></body>'
+    '<body name="cube" pos="1 0 0"><freejoint name="cube"/><geom size="0.02"/></body>'
+    '<geom name="floor" type="plane" size="1 1 .1"/>'
+)
+
+
+def test_a_file_of_several_root_bodies_names_its_robot(tmp_path):
+    qpos = [*SIX, 1, 0, 0, 1, 0, 0, 0]
+    xml = six(qpos=qpos, inside=OTHERS).replace(
+        "</mujoco>",
+        '<equality><weld body1="palm" body2="cube"/></equality>'
+        '<actuator><motor joint="cube"/></actuator></mujoco>',
+    )
+    carriage = "carriage = true\n" + SIX_PALM
+    refused(
+        lambda: written(tmp_path, xml, SIX_HAND.format(carriage)),
+        "one root body", "'palm', 'table', 'cube'", "geoms of the world", 'root = "BODY"',
+    )  # fmt: skip
+    for line in ('root = "palm"\n', ""):
+        toml = SIX_HAND.format(line + carriage)
+        if not line:
+            toml = toml.replace('"tiny.xml"', '{ file = "tiny.xml", root = "palm" }')
+        robot = written(tmp_path, xml, toml)
+        np.testing.assert_array_equal(robot.home, [0.0] * 6 + SIX)
+        assert robot.model.body(1).name == "palm" and robot.model.nu == 0
+        assert "floor" not in [robot.model.geom(g).name for g in range(robot.model.ngeom)]
+        assert "not compared" in check(tmp_path)
+    refused(
+        lambda: written(tmp_path, xml, SIX_HAND.format('root = "plam"')),
+        "root of tiny.xml", "no root body 'plam'; did you mean 'palm'?",
+    )  # fmt: skip
+    two = 'root = "palm"\n[[model]]\nfile = "tiny.xml"\n' + TIPS
+    refused(lambda: written(tmp_path, xml, two), "root belongs into [[model]]")
+
+
+def test_a_carriage_refuses_a_root_with_joints_of_its_own(tmp_path):
+    toml = "carriage = true\n" + BASED + SHORT
+    refused(lambda: written(tmp_path, NO_KEYS, toml), "'lift' moves 'palm'", "body of its own")
+
+
+@pytest.mark.parametrize("placed", ['euler="0.3 -0.2 2"', 'axisangle="1 2 3 0.7"', "frame"])
+def test_a_carriage_holds_the_palm_whatever_the_file_places_it_by(tmp_path, placed):
+    """Euler angles and frames of the file stay in force in MuJoCo beside a pose that is set."""
+    xml = six()
+    if placed == "frame":
+        xml = change(
+            xml, '<body name="palm">', '<frame pos="1 2 3" euler="1 0 0"><body name="palm">'
+        )
+        xml = change(xml, "</worldbody>", "</frame></worldbody>")
+    else:
+        xml = change(xml, '<body name="palm">', f'<body name="palm" {placed}>')
+    robot = written(tmp_path, xml, SIX_HAND.format("carriage = true\n" + SIX_PALM))
+    p, R = robot.palm(robot.home)
+    level, down = np.cos(np.radians(40)), np.sin(np.radians(40))
+    np.testing.assert_allclose(R[:, 2], [level, 0, -down], atol=1e-9)
+    np.testing.assert_allclose(p, 0.0, atol=1e-9)
+
+
+def test_a_scene_moves_all_of_a_robot_and_keeps_frames(tmp_path):
+    """A body in a <frame>, files that stand side by side, and geoms of the world."""
+    base = (0.0, 0.0, 1.0, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    xml = change(six(), '<body name="palm">', '<frame pos="1 0 0"><body name="palm">')
+    xml = change(
+        xml, "</worldbody>", '</frame><geom name="foot" pos="2 0 0" size="0.1"/></worldbody>'
+    )
+    tiny_hand.write(tmp_path, xml, SIX_HAND.format(""))
+    alone, moved = Scene(tmp_path).articulated, Scene(tmp_path, base=base).articulated
+    x = written(tmp_path, xml, SIX_HAND.format("")).centers(alone.home)
+    np.testing.assert_allclose(alone.centers(alone.home), x, atol=EXACT)
+    turned = np.column_stack([-x[:, 1], x[:, 0], x[:, 2] + 1.0])
+    np.testing.assert_allclose(moved.centers(moved.home), turned, atol=EXACT)
+    np.testing.assert_allclose(moved.model.geom("foot").pos, [0, 2, 1], atol=EXACT)
+    toml = """
+        [[model]]
+        file = "tiny.xml"
+        [[model]]
+        file = "tiny.xml"
+        prefix = "b_"
+        pos = [0.0, 0.0, 0.5]
+        [[contact_points]]
+        link = "l3"
+        [[contact_points]]
+        link = "b_l3"
+    """
+    (tmp_path / "two.toml").write_text(toml)
+    robot, scene = robot_of(tmp_path / "two.toml"), Scene(tmp_path / "two.toml").articulated
+    assert np.ptp(robot.centers(robot.home)[:, 2]) == pytest.approx(0.5)
+    np.testing.assert_allclose(scene.centers(robot.home), robot.centers(robot.home), atol=EXACT)
+
+
+# ---------------------------------------------------------------- names, equalities, tendons
+
+
+def test_joints_without_names_are_named_after_their_bodies_and_recorded(tmp_path):
+    toml = SIX_HAND.format("carriage = true\n" + SIX_PALM + "velocity = { l1_joint = 0.5 }")
+    robot = written(tmp_path, six(names=False), toml)
+    joints = [f"{body}_joint" for body in ("l1", "l2", "l3", "r1", "r2", "r3")]
+    assert robot.joints[6:] == tuple(joints) and len(set(robot.joints)) == 12
+    np.testing.assert_array_equal(robot.home[6:], SIX)
+    scene = Scene(tmp_path, Cylinder(0.03))
+    record = hg.Trial(scene, hg.stack_of("f"), probes=1).run(seed=1)
+    columns = [name for name in record.rows[0] if name.startswith("q_")]
+    assert len(columns) == 12, columns
+
+
+def test_names_that_are_given_are_never_taken_twice(tmp_path):
+    """Bodies too: several joints of one body, a body without a name, and a name that is taken."""
+    xml = change(NO_KEYS, LIFT, '<joint type="slide" axis="0 0 1"/><joint axis="0 0 1"/>')
+    xml = change(xml, 'name="proximal" axis', 'name="palm_joint_2" axis')
+    xml = change(xml, 'joint2="proximal"', 'joint2="palm_joint_2"')
+    xml = change(xml, '<body name="proximal">', "<body>")
+    robot = written(tmp_path, xml)
+    assert robot.joints == ("palm_joint_1", "palm_joint_2_", "palm_joint_2")
+    assert [robot.model.body(b).name for b in range(4)] == ["world", "palm", "palm_body", "distal"]
+
+
+WELD = '<weld name="hold" body1="distal" body2="palm"/>'
+
+
+def test_a_weld_of_links_is_refused_as_a_loop_is(tmp_path):
+    xml = change(XML, "<equality>", f"<equality>{WELD}")
+    refused(lambda: written(tmp_path, xml), "equality hold welds two links", "drop_couplings")
+    robot = written(tmp_path, xml, 'drop_couplings = ["hold"]\n' + SHORT)
+    assert robot.joints == ("lift", "proximal")  # the file's other coupling is kept
+    site = '<weld name="hold" site1="tip_center" site2="palm"/>'
+    refused(lambda: written(tmp_path, change(XML, "<equality>", f"<equality>{site}")), "welds two")
+    world = '<connect name="loop" body1="distal" anchor="0 0 0"/>'
+    refused(lambda: written(tmp_path, change(XML, "<equality>", f"<equality>{world}")), "loop of")
+
+
+def test_an_equality_that_binds_no_joint_is_let_be(tmp_path):
+    """One that is switched off, and one of two bodies that no joint moves apart."""
+    off = WELD.replace("/>", ' active="false"/>')
+    assert written(tmp_path, change(XML, "<equality>", f"<equality>{off}")).n == 2
+    nail = change(XML, '<site name="tip_center"', '<body name="nail"/><site name="tip_center"')
+    nail = change(nail, "<equality>", f"<equality>{WELD.replace('palm', 'nail')}")
+    assert written(tmp_path, nail).n == 2
+    mocap = change(FREE, "</worldbody>", '<body name="hook" mocap="true"/></worldbody>')
+    mocap = change(mocap, "<equality>", '<equality><weld body1="hook" body2="palm"/>')
+    assert written(tmp_path, mocap, 'lock = ["root"]\n' + SHORT).n == 1
+
+
+def test_couplings_that_are_said_replace_the_files(tmp_path):
+    line = 'couplings = [{ joint = "distal", to = "proximal", ratio = 0.25 }]\n'
+    robot = written(tmp_path, NO_KEYS, line + SHORT)
+    np.testing.assert_array_equal(robot.coupling, [[1, 0], [0, 1], [0, 0.25]])
+    assert "left out, of the files' equalities: follow" in check(tmp_path)
+    # all of them, loops too
+    looped = change(NO_KEYS, "<equality>", f"<equality>{CONNECT}{WELD}")
+    np.testing.assert_array_equal(written(tmp_path, looped, line + SHORT).coupling, robot.coupling)
+    assert written(tmp_path, NO_KEYS, "couplings = []\n" + SHORT).n == 3
+    # but for those that drop_couplings leaves in
+    lift = 'couplings = [{ joint = "lift", to = "proximal", ratio = 0.1 }]\n'
+    both = written(tmp_path, NO_KEYS, lift + "drop_couplings = []\n" + SHORT)
+    np.testing.assert_allclose(both.coupling, [[0.1], [1], [0.5]])
+    assert written(tmp_path, NO_KEYS, lift + SHORT).joints == ("proximal", "distal")
+    assert "left out" not in check(tiny_hand.write(tmp_path, XML, SHORT))
+    twice = line + "drop_couplings = []\n" + SHORT
+    refused(lambda: written(tmp_path, NO_KEYS, twice), "contradict or repeat", "'distal'")
+
+
+def test_a_urdfs_mimics_are_replaced_too(tmp_path):
+    path = claw(tmp_path, toml='couplings = [{ joint = "right_joint", to = "left_joint" }]')
+    xml = (tmp_path / "claw.urdf").read_text()
+    mimic = '<mimic joint="left_joint" multiplier="0.5"/></joint>'
+    head, _, tail = xml.rpartition("</joint>")
+    (tmp_path / "claw.urdf").write_text(head + mimic + tail)
+    about = RobotDescription.load(path)
+    C = compiled(about)
+    assert C.neq == 1 and C.eq_data[0, 1] == 1.0
+
+
+TENDONS = """<tendon>
+  <fixed name="pull"><joint joint="proximal" coef="1"/><joint joint="distal" coef="1"/></fixed>
+  <fixed name="stop" limited="true" range="0 1"><joint joint="distal" coef="1"/></fixed>
+  <spatial name="cord" range="0 0.2" limited="true"><site site="palm"/><site site="tip_center"/>
+  </spatial>
+  <fixed name="idle"><joint joint="proximal" coef="1"/></fixed></tendon>
+  <actuator><position tendon="pull" kp="1"/></actuator></mujoco>"""
+
+
+def test_the_check_names_the_tendons_that_are_not_read(tmp_path):
+    xml = change(NO_KEYS, "</mujoco>", TENDONS)
+    tiny_hand.write(tmp_path, xml, "drop_couplings = true\n" + SHORT)
+    text = check(tmp_path)
+    for words in (
+        "tendons that are not read",
+        "pull over proximal, distal: an actuator drives it",
+        "stop over distal: its length is limited to 0 … 1",
+        "cord over sites, along a path in space: its length is limited to 0 … 0.2",
+    ):
+        assert words in text, text
+    assert "idle" not in text
+    (line,) = [v for v in text.splitlines() if v.startswith("couplings = ")]
+    told = written(tmp_path, xml, line + "\n" + SHORT)
+    np.testing.assert_array_equal(told.coupling, [[1, 0], [0, 1], [0, 1]])
+    assert "pull" not in check(tmp_path)
+    assert "tendons" not in check(tiny_hand.write(tmp_path, XML, SHORT))
+
+
+# ---------------------------------------------------------------- files as others save them
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_a_description_may_begin_with_a_byte_order_mark(tmp_path, encoding, ending):
+    tiny_hand.write(tmp_path)
+    text = ('description = "Händchen"\n\t' + SHORT).replace("\n", ending)
+    (tmp_path / "robot.toml").write_bytes(text.encode(encoding))
+    assert robot_of(tmp_path).n == 2
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_description_in_another_encoding_is_refused(tmp_path, encoding):
+    tiny_hand.write(tmp_path)
+    (tmp_path / "robot.toml").write_bytes(('description = "Händchen"\n' + SHORT).encode(encoding))
+    refused(lambda: robot_of(tmp_path), "robot.toml is not UTF-8", "byte", "save it")
+
+
+def test_a_description_that_cannot_be_read_says_so(tmp_path):
+    (tmp_path / "robot.toml").mkdir()
+    refused(lambda: robot_of(tmp_path), "no robot")
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_model_in_another_encoding_is_named(tmp_path, encoding):
+    tiny_hand.write(tmp_path, toml=SHORT)
+    (tmp_path / "tiny.xml").write_bytes(change(XML, '"tip"', '"fühler"').encode(encoding))
+    refused(lambda: robot_of(tmp_path), "tiny.xml is not a valid MJCF")
+    path = claw(tmp_path)
+    text = (tmp_path / "claw.urdf").read_text().replace('"base"', '"fuß"')
+    (tmp_path / "claw.urdf").write_bytes(text.encode("latin-1"))
+    refused(lambda: robot_of(path), "claw.urdf is not a valid URDF")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("clearance = nan", "clearance must be a finite number"),
+        ("clearance = inf", "clearance must be a finite number"),
+        ("clearance = -0.001", "clearance must be 0 or more"),
+        ('clearance = "0.005"', "clearance must be a finite number"),
+        ("clearance = true", "clearance must be a finite number"),
+        ("home = { proximal = nan }", "home of proximal must be a finite number"),
+        ("speed = -1.0", "speed must be finite and above 0"),
+        ("speed = nan", "speed must be finite and above 0"),
+        ("start = { advance = nan }", "start.advance must be a finite number"),
+        ("start = { elevation = [nan, 1] }", "start.elevation"),
+        ("ranges = { lift = [nan, 1] }", "ranges of lift"),
+        ("ranges = { lift = [1, 0] }", "ranges of lift must be [low, high]"),
+        ("workspace = [0, nan, 0]", "workspace"),
+        ('couplings = [{ joint = "distal", to = "proximal", ratio = inf }]', "couplings.ratio"),
+        ('palm = { body = "palm", pos = [nan, 0, 0] }', "palm.pos"),
+    ],
+)
+def test_no_number_of_a_description_may_be_nan(tmp_path, line, words):
+    refused(lambda: written(tmp_path, toml=f"{line}\n{SHORT}"), "robot.toml", words)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('pos="0.06 0 0"', 'pos="nan 0 0"', "body 'distal'"),
+        ('range="0 3"', 'range="0 nan"', "joint 'proximal'"),
+        ('type="sphere" size="0.01"', 'type="sphere" size="nan"', "nan"),
+        ('<site name="palm"/>', '<site name="palm" pos="0 nan 0"/>', "site 'palm'"),
+        ("0 0.5 0 0 0", "0 nan 0 0 0", "equality follow"),
+    ],
+)
+def test_a_model_with_a_nan_is_refused_by_name(tmp_path, monkeypatch, old, new, words):
+    monkeypatch.chdir(tmp_path)
+    refused(lambda: written(tmp_path, change(NO_KEYS, old, new)), words, "nan")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('xyz="-0.06 0 0"', 'xyz="nan 0 0"', "body 'left'"),
+        ('xyz="0 1 0"', 'xyz="0 nan 0"', "joint 'left_joint'"),
+        ('radius="0.01"', 'radius="nan"', "nan"),
+        ('mass value="1"', 'mass value="nan"', "'left'"),  # MuJoCo's own words
+    ],
+)
+def test_a_urdf_with_a_nan_is_refused_by_name(tmp_path, monkeypatch, old, new, words):
+    monkeypatch.chdir(tmp_path)
+    path = claw(tmp_path)
+    (tmp_path / "claw.urdf").write_text((tmp_path / "claw.urdf").read_text().replace(old, new))
+    refused(lambda: robot_of(path), words)
+
+
+def test_a_locked_joint_stands_within_its_range(tmp_path):
+    xml = change(NO_KEYS, 'range="-0.5 0.5"', 'range="0.2 0.5"')
+    robot = written(tmp_path, xml, 'lock = ["lift"]\n' + SHORT)
+    np.testing.assert_array_equal(robot.offset, [0.2, 0, 0])
+    toml = 'lock = ["lift"]\nhome = { lift = 0.9 }\n' + SHORT
+    refused(lambda: written(tmp_path, xml, toml), "'lift'", "held at 0.9", "range [0.2, 0.5]")
+
+
+def test_a_ball_joint_is_refused_without_the_advice_to_lock_it(tmp_path):
+    xml = change(NO_KEYS, LIFT, '<joint name="wrist" type="ball"/>')
+    with pytest.raises(ModelError, match=r"'wrist' .* neither hinge nor slide") as told:
+        written(tmp_path, xml)
+    assert "lock" not in str(told.value)
+    refused(lambda: written(tmp_path, xml, 'lock = ["wrist"]\n' + SHORT), "lock", "'wrist'")
+    refused(lambda: written(tmp_path, xml, "home = { wrist = 1.0 }\n" + SHORT), "home", "'wrist'")
+
+
+def test_a_urdf_is_not_probed_physically_and_the_way_out_is_said(tmp_path):
+    """Coupled or not: it has neither sites to feel at nor servos."""
+    path = claw(tmp_path)
+    nail = FINGER.format(n="nail", x=0, s=1, shape=BALL).replace('"base"', '"left"')
+    nail = nail.replace("</joint>", '<mimic joint="left_joint" multiplier="0.5"/></joint>')
+    (tmp_path / "claw.urdf").write_text(
+        change((tmp_path / "claw.urdf").read_text(), "</robot>", nail + "</robot>")
+    )
+    scene = Scene(path, Cylinder(0.03), (0.0, 0.0, 0.1))
+    trial = hg.Trial(scene, hg.stack_of("fm"), probe="physical")
+    refused(lambda: trial.run(seed=1), "site", "left of claw has none", "geometrically")
+
+
 # ---------------------------------------------------------------- touching with any shape
 
 
@@ -391,9 +871,6 @@ def test_a_file_that_is_joined_needs_a_prefix_and_a_body_that_is_there(tmp_path)
 
 BARE = change(XML, '<site name="palm"/>', '<site name="palm"/><body name="bare"/>')
 NEGATIVE = change(change(XML, "0 0.5 0 0 0", "0 -1 0 0 0"), 'range="-0.1 0.8"', 'range="0 3"')
-LIFT = '<joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>'
-FREE = change(XML, LIFT, '<freejoint name="root"/>')
-FREE = FREE[: FREE.index("  <keyframe>")] + "</mujoco>"
 JOINED = '[[model]]\nfile = "tiny.xml"\n[[model]]\nfile = "tiny.xml"\n[[contact_points]]\n'
 TWO = (
     SHORT + 'flexion = ["proximal"]\n[[contact_points]]\nlink = "palm"\nball = { radius = 0.01 }\n'

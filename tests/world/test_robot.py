@@ -308,7 +308,8 @@ def test_random_ratios_and_offsets_never_leave_a_range_by_rounding(tmp_path):
         middle = ratio * rng.uniform(0.5, 2.5) + rest  # where the proximal joint is inside its own
         low, high = middle - rng.uniform(0.05, 0.5), middle + rng.uniform(0.05, 0.5)
         xml = change(XML, "0 0.5 0 0 0", f"{rest:.17g} {ratio:.17g} 0 0 0")
-        robot = build(tmp_path, change(xml, "-0.1 0.8", f"{low:.17g} {high:.17g}"))
+        xml = change(xml, "-0.1 0.8", f"{low:.17g} {high:.17g}")
+        robot = build(tmp_path, xml, change(TOML, 'home = "home"', "home = {}"))
         for q in (robot.q_lower, robot.q_upper):
             assert robot.violation(q) == 0.0
         for share in rng.uniform(size=5):

@@ -170,11 +170,12 @@ def test_distances_to_a_cylinder_are_those_to_its_circle(tip_over):
 
 
 def test_a_scene_holds_the_robot_as_it_is_alone():
-    alone = mujoco.MjModel.from_xml_path(str(Scene().articulated.description.xml))
-    model = Scene().model
+    robot = Scene().articulated
+    alone, model = mujoco.MjModel.from_xml_path(str(robot.description.xml)), robot.model
     assert (model.nq, model.neq, model.nu) == (alone.nq, alone.neq, alone.nu)
     assert model.ngeom == alone.ngeom + 1 and model.nbody == alone.nbody + 1
-    np.testing.assert_array_equal(model.key_qpos, alone.key_qpos)
+    full = robot.coupling @ robot.home + robot.offset
+    np.testing.assert_allclose(full, alone.key("home").qpos, atol=1e-12)
     np.testing.assert_array_equal(model.jnt_range, alone.jnt_range)
 
 
