@@ -871,11 +871,21 @@ def test_a_file_that_is_joined_needs_a_prefix_and_a_body_that_is_there(tmp_path)
 
 BARE = change(XML, '<site name="palm"/>', '<site name="palm"/><body name="bare"/>')
 NEGATIVE = change(change(XML, "0 0.5 0 0 0", "0 -1 0 0 0"), 'range="-0.1 0.8"', 'range="0 3"')
+TABLE = change(NO_KEYS, "</worldbody>", '<body name="table"/></worldbody>')
 JOINED = '[[model]]\nfile = "tiny.xml"\n[[model]]\nfile = "tiny.xml"\n[[contact_points]]\n'
 TWO = (
     SHORT + 'flexion = ["proximal"]\n[[contact_points]]\nlink = "palm"\nball = { radius = 0.01 }\n'
 )
 CONNECT = '<connect name="loop" body1="distal" body2="palm" anchor="0 0 0"/>'
+
+
+def latin_1(folder):
+    tiny_hand.write(folder)
+    text = 'description = "Händchen"\n' + SHORT
+    (folder / "robot.toml").write_bytes(text.encode("latin-1"))
+    return robot_of(folder)
+
+
 REFUSALS = (
     lambda folder: written(folder, NEGATIVE),
     lambda folder: written(folder, change(XML, "0 0.5 0 0 0", "-1 -1 0 0 0")),
@@ -883,6 +893,15 @@ REFUSALS = (
     lambda folder: written(folder, toml=TWO),
     lambda folder: written(folder, FREE),
     lambda folder: written(folder, change(XML, "<equality>", f"<equality>{CONNECT}")),
+    lambda folder: written(folder, change(XML, "<equality>", f"<equality>{WELD}")),
+    lambda folder: written(folder, change(NO_KEYS, LIFT, '<joint name="wrist" type="ball"/>')),
+    lambda folder: written(folder, FREE, "carriage = true\n" + BASED + SHORT),
+    lambda folder: written(folder, TABLE, "carriage = true\n" + BASED + SHORT),
+    lambda folder: written(folder, change(XML, 'qpos="0 0.2 0.1"', 'qpos="0 0.2"')),
+    lambda folder: written(folder, NO_KEYS, 'lock = ["lift"]\nhome = { lift = 0.9 }\n' + SHORT),
+    lambda folder: written(folder, change(NO_KEYS, 'pos="0.06 0 0"', 'pos="nan 0 0"')),
+    lambda folder: latin_1(folder),
+    lambda folder: written(folder, toml="clearance = nan\n" + SHORT),
     lambda folder: robot_of(claw(folder, '<mesh filename="tip.dae"/>')),
     lambda folder: robot_of(claw(folder, '<mesh filename="package://claw/tip.stl"/>')),
     lambda folder: robot_of(claw(folder, '<mesh filename="tip.obj"/>')),
@@ -897,7 +916,8 @@ REFUSALS = (
 )
 
 
-def test_the_docs_quote_every_refusal_in_its_own_words(tmp_path):
+def test_the_docs_quote_every_refusal_in_its_own_words(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo keeps a log of the NaNs it warns of
     page = (Path(__file__).parents[2] / "docs" / "any-robot.md").read_text(encoding="utf-8")
     table = page.partition("## When it is refused")[2].partition("## ")[0]
     quoted = re.findall(r"^\| `(.+?)` \|", table, re.MULTILINE)
