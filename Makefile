@@ -8,6 +8,8 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip install --quiet --no-input --disable-pip-version-check
 # numba compiles the solver at its first call and keeps what it made: half a minute, once.
 COMPILE := $(PY) -c 'import numpy as n, hqp_grasp as h; h.HQP().solve([h.Level.equal(n.eye(2), n.ones(2))])'
+# Never --quiet, under which mkdocs counts no warning and so passes a broken link.
+SITE := $(PY) -m mkdocs build --strict
 # One stamp for each state of $(VENV), so that nothing is installed twice.
 MADE := $(VENV)/.made
 READY := $(VENV)/.ready
@@ -50,7 +52,7 @@ demo: $(READY)
 
 test: lint $(READY_DEV)
 	$(PY) -m pytest $(PYTEST_ARGS)
-	$(PY) -m mkdocs build --strict --quiet
+	$(SITE)
 
 test-all: test $(READY_ALL)
 	$(PY) -m pytest $(PYTEST_ARGS) -m "browser or cluster"
@@ -64,7 +66,7 @@ lint: $(READY_DEV)
 	$(PY) -m mypy
 
 docs: $(READY_DEV)
-	$(PY) -m mkdocs build --strict
+	$(SITE)
 
 pictures: $(READY_ALL)
 	$(PY) docs/drawings.py

@@ -1,11 +1,15 @@
 """The site in docs/: built strictly, read offline from the disk, on a desktop and on a phone."""
 
 import importlib.util
+import os
 import re
+import shlex
 import subprocess
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pytest
@@ -23,10 +27,53 @@ PHONE = {"width": 390, "height": 800}
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     out = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", out]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = build(ROOT / "mkdocs.yml", out)
     assert done.returncode == 0, done.stdout + done.stderr
     return out
+
+
+def build(config, out):
+    """What `make docs` and `make test` do."""
+    make = ["make", "--dry-run", "docs", f"PY={sys.executable}"]
+    said = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    (line,) = [line for line in said.splitlines() if "mkdocs build" in line]
+    command = [*shlex.split(line), "--config-file", config, "--site-dir", out]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def broken_links(site):
+    """Each page with what it refers to, by link, picture, script or frame, that is not there."""
+    pages = {p.resolve(): Page(p.read_text(encoding="utf-8")) for p in pages_of(site)}
+    for page, found in pages.items():
+        for reference in found.references:
+            url = urlsplit(reference)
+            if url.scheme or url.netloc:
+                continue  # elsewhere, or in the page itself: the site is read offline
+            path = (page.parent / unquote(url.path)).resolve() if url.path else page
+            there = path.exists()
+            if there and url.fragment and path in pages:
+                there = unquote(url.fragment) in pages[path].places
+            if not there:
+                yield page.relative_to(site.resolve()).as_posix(), reference
+
+
+class Page(HTMLParser):
+    """What a page refers to, and the places in it that can be referred to."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.references, self.places = set(), {"", "__top"}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name in ("href", "src", "data", "poster"):
+                self.references.add(value or "")
+            elif name in ("id", "name"):
+                self.places.add(value)
 
 
 @pytest.fixture
@@ -58,6 +105,61 @@ def test_no_equation_is_left_as_it_was_typed(site):
     pages = [page.read_text(encoding="utf-8") for page in site.glob("*.html")]
     assert not any('class="arithmatex"' in page for page in pages)
     assert sum(page.count("<math") for page in pages) > 100
+
+
+def test_every_link_of_the_site_leads_somewhere(site):
+    assert list(broken_links(site)) == []
+
+
+@pytest.mark.parametrize(
+    "page", [*ROOT.glob("*.md"), *ROOT.glob("*/*/README.md")], ids=lambda p: p.parent.name + p.name
+)
+def test_links_of_pages_outside_the_site_lead_to_files(page):
+    found = re.findall(r"\]\((?!https?:)([^)#\s]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in found if not (page.parent / link).exists()] == []
+
+
+BROKEN = {  # by what mkdocs names
+    "nowhere.md": "[page](nowhere.md)",
+    "index.md#nowhere": "[place](index.md#nowhere)",
+    "#nothing": "[place](#nothing)",
+    "hqp_grasp.NoLaw": "[law][hqp_grasp.NoLaw]",
+    "rad, m": "| a |\n|---|\n| [low, high] [rad, m] |",
+    "nowhere.png": "![picture](nowhere.png)",
+    "../README.md": "[outside](../README.md)",
+}
+
+
+def test_a_broken_link_fails_the_step_that_builds_the_docs(tmp_path):
+    sound = build(small(tmp_path, "[here](#here)\n\n## Here"), tmp_path / "site")
+    assert sound.returncode == 0, sound.stderr
+    failed = build(small(tmp_path, "\n\n".join(BROKEN.values())), tmp_path / "site")
+    assert failed.returncode != 0
+    said = [line for line in failed.stderr.splitlines() if line.startswith("WARNING")]
+    for name in BROKEN:
+        assert sum(f"'{name}'" in line for line in said) == 1, failed.stderr
+    assert len(said) == len(BROKEN)
+
+
+def test_what_mkdocs_takes_as_it_stands_is_checked_in_the_site(tmp_path):
+    page = '<a href="{}"><a href="#{}"><img src="{}"><a href="https://a.b/c">'
+    (tmp_path / "index.html").write_text(page.format("index.html", "here", "index.html#here"))
+    assert {found for _, found in broken_links(tmp_path)} == {"#here", "index.html#here"}
+    (tmp_path / "index.html").write_text('<p id="here">' + page.format("no.html", "here", "no.png"))
+    assert {found for _, found in broken_links(tmp_path)} == {"no.html", "no.png"}
+
+
+def small(folder, text):
+    """A site of one page, built as ours is; its mkdocs.yml."""
+    ours = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    config = re.sub(r"(?ms)^(theme|extra|nav|hooks|extra_css|exclude_docs):.*?(?=^\w)", "", ours)
+    config = config.replace("            extensions: [docs/reference.py]\n", "")
+    (folder / "docs").mkdir(exist_ok=True)
+    (folder / "docs/index.md").write_text(f"# Small\n\n{text}\n", encoding="utf-8")
+    (folder / "mkdocs.yml").write_text(
+        config + "theme: {name: material, font: false}\n", encoding="utf-8"
+    )
+    return folder / "mkdocs.yml"
 
 
 def test_the_reference_has_all_that_is_exported(site):
