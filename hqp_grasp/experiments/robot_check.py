@@ -14,7 +14,7 @@ from hqp_grasp.world.robot import CAPSULE, SPHERE, Robot, compiled, described
 from hqp_grasp.world.second_opinion import second_opinion
 
 CLOSINGS = np.linspace(0.0, 1.0, 21)  # shares by which fingers are closed
-AGREES = 1e-6  # [m] two readings of a file that differ by less are the same
+AGREES = 1e-6  # [m, rad] two readings that differ by less are the same
 
 
 def check(path: str | Path, hand: str | None = None, picture: str | Path | None = None) -> str:
@@ -25,7 +25,7 @@ def check(path: str | Path, hand: str | None = None, picture: str | Path | None 
     about = described(path, hand)
     robot = Robot(about, compiled(about))
     clearance = SelfClearance(robot, max(about.clearance, 1e-4))
-    out = about.left_out
+    out = [name for name, stays in about.equalities.items() if not stays]
     text = "\n".join(
         [
             f"{about.name}: {robot.n} independent joints, {robot.model.njnt} in all; hands: "
@@ -34,6 +34,7 @@ def check(path: str | Path, hand: str | None = None, picture: str | Path | None 
             "",
             *_joints(robot),
             *([f"left out, of the files' equalities: {', '.join(out)}"] if out else []),
+            *_followers(robot),
             *_tendons(robot),
             "",
             *_contact_points(robot),
@@ -66,7 +67,7 @@ def _files(about: RobotDescription) -> list[str]:
 
 
 def _joints(robot: Robot) -> list[str]:
-    names = [robot.model.joint(j).name for j in range(robot.model.njnt)]
+    names = _names(robot)
     width = max(map(len, robot.joints))
     lines = [f"{'joint':{width}}  {'range':>16}  {'home':>7}  {'speed':>6}  drives"]
     for j, joint in enumerate(robot.joints):
@@ -82,6 +83,20 @@ def _joints(robot: Robot) -> list[str]:
             f"{joint:{width}}  {ends:>16}  {robot.home[j]:7.2f}  {robot.velocity[j]:6.2f}  {role}"
         )
     return lines
+
+
+def _followers(robot: Robot) -> list[str]:
+    """Coupled joints that home would have elsewhere than they follow to."""
+    full = dict(zip(_names(robot), robot.coupling @ robot.home + robot.offset, strict=True))
+    return [
+        f"home has {joint} at {angle:.3g}; it is coupled, and follows to {full[joint]:.3g}"
+        for joint, angle in robot.description.home.items()
+        if abs(full[joint] - angle) > AGREES
+    ]
+
+
+def _names(robot: Robot) -> list[str]:
+    return [robot.model.joint(j).name for j in range(robot.model.njnt)]
 
 
 def _tendons(robot: Robot) -> list[str]:
@@ -120,10 +135,10 @@ def _tendons(robot: Robot) -> list[str]:
     ]
     if together:
         told += [
-            "  Were all their joints to turn alike, add",
+            "  Were all their joints to turn alike, this would be among the couplings:",
             f"couplings = [{', '.join(together)}]",
         ]
-        if model.neq:
+        if any(robot.description.equalities.values()):
             told += ["drop_couplings = []  # keeps the files' own equalities"]
     return told
 

@@ -360,13 +360,6 @@ class RobotDescription:
                 )
             child, more = self._part(part)
             fixed |= more
-            loose = next((j for j in child.joints if j.type == FREE), None)
-            if part.at and loose is not None:
-                name = part.prefix + loose.name
-                raise ModelError(
-                    f"{part.file.name} has a free base {name!r}, which {part.at!r} cannot carry: "
-                    f'lock = ["{name}"] fixes it'
-                )
             body = spec.body(part.at) if part.at else spec.worldbody
             if body is None:
                 _known("body", part.at, [b.name for b in spec.bodies], f"at of {part.file.name}")
@@ -381,14 +374,23 @@ class RobotDescription:
         """One of the files, without keyframes, and the free bases that `lock` fixed in it."""
         spec, fixed = part.spec(), set()
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
-        for body in spec.worldbody.bodies:
-            for joint in body.joints:
-                name = part.prefix + joint.name
-                if joint.type == FREE and name in self.lock:
-                    if name in self.bases:
-                        _place(spec, body, self.bases[name][:3], self.bases[name][3:])
-                    spec.delete(joint)
-                    fixed.add(name)
+        for joint in [j for j in spec.joints if j.type == FREE]:
+            name, body = part.prefix + joint.name, joint.parent
+            carrier = part.at if body.parent == spec.worldbody else body.parent.name
+            if name in self.lock:
+                if name in self.bases:
+                    _place(spec, body, self.bases[name][:3], self.bases[name][3:])
+                for actuator in [a for a in spec.actuators if a.target == joint.name]:
+                    spec.delete(actuator)
+                for sensor in [s for s in spec.sensors if s.objname == joint.name]:
+                    spec.delete(sensor)
+                spec.delete(joint)
+                fixed.add(name)
+            elif carrier:
+                raise ModelError(
+                    f"{part.file.name} has a free base {name!r}, which {carrier!r} cannot carry: "
+                    f'lock = ["{name}"] fixes it'
+                )
         # They are read by now, joint by joint; in a larger model they would list others' angles.
         for key in list(spec.keys):
             spec.delete(key)
@@ -526,10 +528,10 @@ class RobotDescription:
         return not {equality.name, equality.name1}.isdisjoint(self.drop_couplings)
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """The files' equalities that `couplings` replaces or `drop_couplings` names."""
+    def equalities(self) -> dict[str, bool]:
+        """The files' equalities by name, or joint: whether each stays in force."""
         spec, _ = self._joined()
-        return tuple(e.name or e.name1 for e in spec.equalities if self._drops(e))
+        return {e.name or e.name1: not self._drops(e) for e in spec.equalities}
 
     def _joint(self, name: str, joints: Mapping[str, object], where: str) -> str:
         return _known("joint", name, joints, f"{where} of {self.name}")
@@ -647,6 +649,7 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         hands = (_hand({"name": "hand", **{k: data[k] for k in KEYS["hand"] if k in data}}),)
     if not hands:
         raise InputError("hands is empty")
+    _refuse_twice("hands", [hand.name for hand in hands])
     files = tuple(_file(part, folder) for part in parts)
     home, bases = data.get("home"), dict[str, tuple[float, ...]]()
     if home is None or isinstance(home, str):
@@ -718,6 +721,12 @@ def _file(part: object, folder: Path) -> ModelFile:
     )
 
 
+def _refuse_twice(what: str, names: list[str]) -> None:
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"two {what} are named {twice!r}")
+
+
 def _hand(data: object) -> Hand:
     if not isinstance(data, dict):
         raise InputError(f"hands must be tables; got {data!r}")
@@ -725,10 +734,7 @@ def _hand(data: object) -> Hand:
     points = tuple(_contact_point(p) for p in data["contact_points"])
     if not points:
         raise InputError("contact_points is empty")
-    names = [point.name for point in points]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"two contact points are named {twice!r}")
+    _refuse_twice("contact points", [point.name for point in points])
     return Hand(
         _text(data["name"]),
         points,
@@ -761,7 +767,9 @@ def _axes(palm: Palm) -> tuple[np.ndarray, np.ndarray]:
 
 def _contact_point(data: object) -> ContactPoint:
     if not isinstance(data, dict):
-        raise InputError(f"contact_points must be links, or tables; got {data!r}")
+        raise InputError(
+            f'contact_points must be tables, such as {{ link = "BODY" }}; got {data!r}'
+        )
     _check(data, KEYS["contact point"], "contact_points")
     ball = data.get("ball")
     if ball is not None:

@@ -529,11 +529,12 @@ def _id(
 
 
 def _refuse_no_numbers(model: mujoco.MjModel, about: RobotDescription) -> None:
-    """Raise where the file says NaN, which compares false and so passes every other check."""
+    """Raise where the file says NaN, which compares false and so passes every check, or ∞."""
     for kind, names in MEASURES.items():
         for name in names:
             values = getattr(model, f"{kind}_{name}")
-            for i in np.argwhere(np.isnan(values))[:1, 0].tolist():
+            wrong = np.isnan(values) if name == "range" else ~np.isfinite(values)
+            for i in np.argwhere(wrong)[:1, 0].tolist():
                 word = "joint" if kind == "jnt" else kind
                 raise ModelError(
                     f"{word} {getattr(model, word)(i).name!r} of {about.name} has {name} "
@@ -704,7 +705,7 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
         else:
             raise ModelError(
                 f"equality {name} binds neither joints nor links, and no law here knows what "
-                f'it does: drop_couplings = ["{name}"] leaves it out'
+                "it does: drop_couplings = true leaves it out"
             )
         if not np.isfinite(coefficients[:5]).all():
             raise ModelError(f"equality {name} has polycoef {coefficients[:5]}, not all finite")
@@ -733,7 +734,7 @@ def _couplings(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[int]
             names = [repr(model.joint(j).name) for j in sorted(set(dependent))]
             raise ModelError(
                 "the model's couplings contradict or repeat one another; they bind "
-                + ", ".join(names)
+                f"{', '.join(names)}: couplings, drop_couplings or lock say otherwise"
             ) from error
         C[dependent] = -inverse @ E[:, independent]
         c0[dependent] = inverse @ e0

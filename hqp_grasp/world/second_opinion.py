@@ -77,7 +77,7 @@ def second_opinion(part: ModelFile) -> Agreement:
             J = np.zeros((3, model.nv))
             mujoco.mj_jacBody(model, data, J, None, body)
             axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            J_other = pin.getFrameJacobian(other, scratch, frame, axes)[:3]
+            J_other = np.reshape(pin.getFrameJacobian(other, scratch, frame, axes), (6, -1))[:3]
             J_other = J_other[:, [joint.idx_v for joint in at]]
             x = ours.rotation.T @ (data.xpos[body] - ours.translation)
             apart = np.abs(theirs.actInv(scratch.oMf[frame]).translation - x).max()

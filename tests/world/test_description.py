@@ -401,11 +401,44 @@ def test_a_free_base_is_fixed_where_its_file_is_joined(tmp_path):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("root", ["world", "odom"])
+def test_the_floating_joint_of_a_urdf_can_be_locked(tmp_path, root):
+    """Below a root link that is not named world, MuJoCo has it where no free joint may be."""
+    path = claw(tmp_path)
+    floating = f'''<link name="{root}"/><joint name="float" type="floating"><parent link="{root}"/>
+        <child link="base"/><origin xyz="1 0 0"/></joint></robot>'''
+    urdf = change((tmp_path / "claw.urdf").read_text(), "</robot>", floating)
+    (tmp_path / "claw.urdf").write_text(urdf)
+    refused(lambda: robot_of(path), "'float'", 'lock = ["float"]')
+    path.write_text('lock = ["float"]\n' + path.read_text())
+    robot = robot_of(path)
+    assert robot.joints == ("left_joint", "right_joint")
+    np.testing.assert_allclose(robot.centers(robot.home).mean(axis=0), [1, 0, 0.1], atol=EXACT)
+
+
+def test_what_acts_on_a_locked_free_base_goes_with_it(tmp_path):
+    acts = """<actuator><motor joint="root" gear="1 0 0 0 0 0"/><position joint="la"/></actuator>
+        <sensor><jointpos joint="la"/></sensor></mujoco>"""
+    xml = change(six('<freejoint name="root"/>', []), "</mujoco>", acts)
+    robot = written(tmp_path, xml, SIX_HAND.format('lock = ["root"]'))
+    assert (robot.n, robot.model.nu, robot.model.nsensor) == (6, 1, 1)
+
+
 def test_the_check_takes_a_free_base(tmp_path):
     tiny_hand.write(
         tmp_path, six('<freejoint name="root"/>', []), SIX_HAND.format('lock = ["root"]')
     )
     assert "tiny.xml: not compared: a joint is neither hinge nor slide" in check(tmp_path)
+
+
+def test_the_check_takes_a_file_of_one_joint(tmp_path):
+    """Whose Jacobian Pinocchio gives as a vector."""
+    xml = change(
+        change(NO_KEYS, LIFT, ""), '<joint name="distal" axis="0 0 1" range="-0.1 0.8"/>', ""
+    )
+    xml = xml[: xml.index("  <equality>")] + "</mujoco>"
+    tiny_hand.write(tmp_path, xml, SHORT)
+    assert "1 independent joints, 1 in all" in check(tmp_path)
 
 
 OTHERS = (
@@ -525,6 +558,19 @@ def test_names_that_are_given_are_never_taken_twice(tmp_path):
     assert [robot.model.body(b).name for b in range(4)] == ["world", "palm", "palm_body", "distal"]
 
 
+def test_a_home_that_a_coupled_joint_cannot_follow_is_told(tmp_path):
+    toml = "home = { proximal = 0.4, distal = 0.7 }\n" + SHORT
+    tiny_hand.write(tmp_path, NO_KEYS, toml)
+    assert "home has distal at 0.7; it is coupled, and follows to 0.2" in check(tmp_path)
+    assert "home has" not in check(tiny_hand.write(tmp_path, XML, SHORT))
+
+
+def test_two_hands_of_one_name_are_refused(tmp_path):
+    hand = '[[hands]]\nname = "left"\ncontact_points = [{ link = "distal" }]\n'
+    toml = 'model = "tiny.xml"\n' + hand + hand
+    refused(lambda: written(tmp_path, NO_KEYS, toml), "two hands are named 'left'")
+
+
 WELD = '<weld name="hold" body1="distal" body2="palm"/>'
 
 
@@ -601,11 +647,23 @@ def test_the_check_names_the_tendons_that_are_not_read(tmp_path):
         "cord over sites, along a path in space: its length is limited to 0 … 0.2",
     ):
         assert words in text, text
-    assert "idle" not in text
+    assert "idle" not in text and "drop_couplings" not in text  # no equality is left to keep
     (line,) = [v for v in text.splitlines() if v.startswith("couplings = ")]
     told = written(tmp_path, xml, line + "\n" + SHORT)
     np.testing.assert_array_equal(told.coupling, [[1, 0], [0, 1], [0, 1]])
     assert "pull" not in check(tmp_path)
+    both = check(
+        tiny_hand.write(
+            tmp_path,
+            change(
+                xml,
+                'coef="1"/></fixed>\n  <fixed name="stop"',
+                'coef="1"/><joint joint="lift" coef="1"/></fixed>\n  <fixed name="stop"',
+            ),
+            SHORT,
+        )
+    )
+    assert "drop_couplings = []  # keeps the files' own equalities" in both
     assert "tendons" not in check(tiny_hand.write(tmp_path, XML, SHORT))
 
 
@@ -672,15 +730,17 @@ def test_no_number_of_a_description_may_be_nan(tmp_path, line, words):
     ("old", "new", "words"),
     [
         ('pos="0.06 0 0"', 'pos="nan 0 0"', "body 'distal'"),
+        ('pos="0.06 0 0"', 'pos="inf 0 0"', "body 'distal'"),
         ('range="0 3"', 'range="0 nan"', "joint 'proximal'"),
         ('type="sphere" size="0.01"', 'type="sphere" size="nan"', "nan"),
+        ('type="sphere" size="0.01"', 'type="sphere" size="inf"', "inf"),
         ('<site name="palm"/>', '<site name="palm" pos="0 nan 0"/>', "site 'palm'"),
         ("0 0.5 0 0 0", "0 nan 0 0 0", "equality follow"),
     ],
 )
 def test_a_model_with_a_nan_is_refused_by_name(tmp_path, monkeypatch, old, new, words):
     monkeypatch.chdir(tmp_path)
-    refused(lambda: written(tmp_path, change(NO_KEYS, old, new)), words, "nan")
+    refused(lambda: written(tmp_path, change(NO_KEYS, old, new)), words)
 
 
 @pytest.mark.parametrize(
