@@ -1,6 +1,7 @@
 """Grasping by touch, with control laws in strict order and within a robot's limits."""
 
 from hqp_grasp.control.controller import Controller, Step
+from hqp_grasp.control.forces import GRIP_LAWS, Felt, ForceLaw, Forces, Grip, Squeeze
 from hqp_grasp.control.forms import ClippedForm, HierarchyForm, MemorylessForm, PaperForm
 from hqp_grasp.control.ik import ik_levels, solve_ik
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
@@ -52,6 +53,7 @@ from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
 __all__ = [
+    "GRIP_LAWS",
     "HQP",
     "Body",
     "ClippedForm",
@@ -63,9 +65,13 @@ __all__ = [
     "Cylinder",
     "Driver",
     "DriverLimits",
+    "Felt",
+    "ForceLaw",
     "ForceTask",
+    "Forces",
     "GeometricProbe",
     "Grasp",
+    "Grip",
     "HierarchyForm",
     "HqpGraspError",
     "Imperfections",
@@ -100,6 +106,7 @@ __all__ = [
     "SingularTaskError",
     "Solution",
     "SolverError",
+    "Squeeze",
     "Stack",
     "Start",
     "Step",

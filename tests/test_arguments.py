@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import hqp_grasp as hg
+from hqp_grasp.control.forces import NetForce
 from hqp_grasp.errors import flag, not_negative, number, one_of, positive, whole
 from hqp_grasp.world.imperfections import Fault
 
@@ -41,8 +42,10 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.DriverLimits: dict.fromkeys(("upper", "speed", "torque"), FOUR)
     | {"lower": -FOUR, "force": 1.0, "watchdog": 1.0},
     hg.ForceTask: {},
+    hg.Forces: {"priorities": ((NetForce(),),)},
     hg.GeometricProbe: {"scene": SCENE},
     hg.Grasp: GRASP,
+    hg.Grip: {"robot": ROBOT, "force": 0.25},
     hg.HQP: {},
     hg.HierarchyForm: {},
     hg.Imperfections: {},
@@ -91,7 +94,20 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
 }
 CALLS[hg.Body] = {"file": "", "scale": 1.0}  # the fixture `body` writes the file
 ANSWERS = {  # what the package hands out, and what is abstract
-    *("ContactSpaceTask", "Driver", "LevelReport", "Limit", "Miss", "Priority", "Probe", "Record"),
+    *(
+        "ContactSpaceTask",
+        "Driver",
+        "Felt",
+        "ForceLaw",
+        "GRIP_LAWS",
+        "Squeeze",
+        "LevelReport",
+        "Limit",
+        "Miss",
+        "Priority",
+        "Probe",
+        "Record",
+    ),
     *("Solution", "Step", "Task", "ik_levels", "load_history", "save_history", "solvers"),
 }
 NO_NUMBER = ("0.05", True, 1j, [0.05], object(), b"1", {})

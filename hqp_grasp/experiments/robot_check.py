@@ -60,7 +60,7 @@ def _files(about: RobotDescription) -> list[str]:
             same = max(both.position, both.jacobian) < AGREES
             told = (
                 f"MuJoCo and Pinocchio {'agree' if same else 'DIFFER'}: {both.position:.0e} m, "
-                f"{both.jacobian:.0e} m/rad"
+                f"{both.jacobian:.0e} m/rad, {both.weight:.0e} N·m of its weight"
             )
         lines.append(f"  {part.file.name}: {told}")
     return lines

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import ModelFile
+from hqp_grasp.world.statics import holding
 
 BODY = pin.FrameType.BODY  # a joint may be named like its body
 POSTURES = 3  # random ones that are compared
@@ -22,11 +23,15 @@ class Agreement:
     file: str
     position: float = 0.0  # [m] of any body
     jacobian: float = 0.0  # [m/rad] of any body's origin
+    weight: float = 0.0  # [N·m, N at slides] that holds the robot's own weight at any joint
     reason: str = ""  # why there is no comparison; empty where there is
 
 
 def second_opinion(part: ModelFile) -> Agreement:
-    """Compare bodies and their Jacobians in MuJoCo and Pinocchio, at random postures."""
+    """Compare bodies, their Jacobians and their weight in MuJoCo and Pinocchio.
+
+    That is at random postures.
+    """
     name = part.file.name
     model = compiled_spec(part.spec(), f"{name} does not compile")
     if not model.njnt:
@@ -52,7 +57,7 @@ def second_opinion(part: ModelFile) -> Agreement:
     data, scratch = mujoco.MjData(model), other.createData()
     rng = np.random.default_rng(0)
     low, high = np.where(model.jnt_limited, model.jnt_range.T, [[-1.0], [1.0]])
-    worst = np.zeros(2)
+    worst = np.zeros(3)
     for _ in range(POSTURES):
         data.qpos[:] = rng.uniform(low, high)
         mujoco.mj_kinematics(model, data)
@@ -82,8 +87,12 @@ def second_opinion(part: ModelFile) -> Agreement:
             x = ours.rotation.T @ (data.xpos[body] - ours.translation)
             apart = np.abs(theirs.actInv(scratch.oMf[frame]).translation - x).max()
             turned = np.abs(theirs.rotation.T @ J_other - ours.rotation.T @ J).max()
-            worst = np.maximum(worst, [apart, turned])
-    return Agreement(name, float(worst[0]), float(worst[1]))
+            worst[:2] = np.maximum(worst[:2], [apart, turned])
+        other.gravity.linear = theirs.rotation @ ours.rotation.T @ model.opt.gravity
+        held = pin.computeGeneralizedGravity(other, scratch, q)[[joint.idx_v for joint in at]]
+        worst[2] = max(worst[2], float(np.abs(held - holding(model, data)).max()))
+    position, jacobian, weight = worst.tolist()
+    return Agreement(name, position, jacobian, weight)
 
 
 def _pose(p: np.ndarray, R: np.ndarray) -> pin.SE3:
