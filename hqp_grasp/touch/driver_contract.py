@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -292,20 +293,37 @@ def _off(rig: Rig, i: int, R: np.ndarray, pushed: np.ndarray) -> float:
 
 
 def contact_forces_are_kept(rig: Rig) -> None:
-    """However hard a press is asked for, the force stays below its limit."""
+    """What may be held is held; whatever more is asked for, the force stays below its limit."""
+    limits = rig.driver.limits
     rig.go(rig.open)
+    rig.wait(0.3)
+    before = rig.wait(0.3).wrench[..., :3].mean(axis=0)
     for i in range(len(rig.normals)):
         rig.driver.close(i, CLOSING, TOUCH)
     seen = [_until_touched(rig)]
-    rig.driver.hold(1e3 * rig.driver.limits.force)
+    rig.driver.hold(limits.hold)
+    seen += [rig.wait(0.5 + 0.5 * limits.hold), rig.wait(0.3)]
+    held = np.linalg.norm(seen[-1].wrench[..., :3].mean(axis=0) - before, axis=-1)
+    with suppress(InputError):  # a driver may refuse
+        rig.driver.hold(1e3 * limits.force)
     seen.append(rig.wait(2.0))
     rig.go(rig.open)
-    largest = max(float(np.linalg.norm(r.wrench[..., :3], axis=-1).max()) for r in seen)
-    if largest > rig.driver.limits.force:
+    _must_stay_below("a fingertip felt", seen, limits.force)
+    if seen[-2].fault:
         raise DriverError(
-            f"limits not held: a fingertip felt {largest:.3g} N, the limit is "
-            f"{rig.driver.limits.force:.3g} N"
+            f"hold: {limits.hold:g} N may be asked for, and stops the hand: {seen[-2].fault}"
         )
+    if held.min() < (1.0 - PRESS_TOLERANCE) * limits.hold:
+        raise DriverError(
+            f"hold: {rig._names[int(held.argmin())]} was asked for {limits.hold:g} N, which may be "
+            f"asked for, and reads {held.min():.3g} N"
+        )
+
+
+def _must_stay_below(what: str, seen: Sequence[Readings], limit: float) -> None:
+    largest = max(float(np.linalg.norm(r.wrench[..., :3], axis=-1).max()) for r in seen)
+    if largest > limit:
+        raise DriverError(f"limits not held: {what} {largest:.3g} N, the limit is {limit:.3g} N")
 
 
 # In the order in which they are safe to run: what holds the hand back comes before what needs it.
@@ -355,5 +373,6 @@ def _joined(slices: list[Readings]) -> Readings:
         time=series("time"),
         q=series("q"),
         velocity=series("velocity"),
+        torque=series("torque"),
         wrench=series("wrench"),
     )

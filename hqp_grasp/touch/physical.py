@@ -10,7 +10,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, instance, number, positive
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
-from hqp_grasp.touch.driver import Driver, Readings
+from hqp_grasp.touch.driver import Driver, Readings, require_touch
 from hqp_grasp.touch.geometric import RETREAT
 from hqp_grasp.touch.sensing import sense
 from hqp_grasp.world.robot import Robot
@@ -35,6 +35,7 @@ SETTLING, PRESSING = 0.3, 0.3  # [s], [s/N] that the held force may take: a fing
 PRESSED = 0.1  # [s] of readings that tell whether it is settled
 SETTLED = 0.04  # share of it that may be missing
 SENSING = 0.2  # [s] of readings that are averaged
+FEELING = 0.1  # [s] the same, while the hand is at something else
 LOST = 0.5  # share of the held force below which a contact is none
 SPIKE = 0.5  # share of the held force by which a sample lies beside the others, to count as none
 STEEP = 1.5  # [–] tangential by normal force that no fingertip holds
@@ -57,27 +58,26 @@ class PhysicalProbe:
     robot: Robot
     force: float = 1.0  # [N] held while the contact is sensed
     table: float | None = None  # [m] height of what the object stands on, where it is known
+    _weighed: Readings | None = field(init=False, repr=False)  # open tips, at the last touch
+    _clock: float = field(init=False, repr=False)  # [s] of the newest sample
     _payload: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)  # kg (k,), m (k, 3)
     _data: mujoco.MjData = field(init=False, repr=False)
     _own: tuple[tuple[int, list[int]], ...] = field(init=False, repr=False)  # tips, what they meet
 
     def __post_init__(self) -> None:
         instance("PhysicalProbe.robot", self.robot, Robot)
-        if not isinstance(self.driver, Driver):
-            raise InputError(
-                f"PhysicalProbe.driver must have all that a Driver has; got {self.driver!r}"
-            )
+        require_touch("PhysicalProbe.driver", self.driver)
         object.__setattr__(self, "force", positive("PhysicalProbe.force", self.force))
         if self.table is not None:
             object.__setattr__(self, "table", number("PhysicalProbe.table", self.table))
-        most = self.driver.limits.force
-        if self.force > most:
-            raise InputError(f"PhysicalProbe.force {self.force} N is above the driver's {most} N")
+        self.driver.limits.require_hold("PhysicalProbe.force", self.force)
         if len(self.driver.limits.lower) != self.robot.n:
             raise InputError(
                 f"the driver moves {len(self.driver.limits.lower)} joints, {self.robot} has "
                 f"{self.robot.n}: is it of another robot?"
             )
+        object.__setattr__(self, "_weighed", None)
+        object.__setattr__(self, "_clock", -np.inf)
         object.__setattr__(self, "_payload", payload(self.robot))
         object.__setattr__(self, "_data", mujoco.MjData(self.robot.model))
         object.__setattr__(self, "_own", _own_links(self.robot))
@@ -91,49 +91,92 @@ class PhysicalProbe:
         """
         target = self.robot.require_q("q_target", q_target)
         *passed, away = (self._away(self.robot.require_q("via", q)) for q in (*via, target))
-        heard = self._listen()
-        if isinstance(heard, Missed):
-            return heard
-        way = [self._opened(heard, (passed or [away])[0]), *passed, away]
-        felt = self._touch(way, target[[j for (j,) in self.robot.flexion]])
-        if isinstance(felt, Missed):
-            if felt.reason is Miss.STUCK:
-                self._watch(self.driver, PAUSE)
-            here = self.driver.wait(0.0)
-            back = self._opened(here, away)
-            # Nobody knows what a finger is at: it may be behind the object.
-            self._go(back, 2.0 * float(np.abs(back - here.q[-1]).max()) / SWIFT)
-            self._go(way[-2], MOVING)
+        object.__setattr__(self, "_clock", -np.inf)
+        try:
+            heard = self._listen()
+            if isinstance(heard, Missed):
+                return heard
+            way = [self._opened(heard, (passed or [away])[0]), *passed, away]
+            felt = self._touch(way, target)
+            if isinstance(felt, Missed):
+                self._retreat(felt, way)
+        except _SilentError as what:
+            self.driver.stop()
+            return Missed(Miss.SENSOR, str(what))
         return felt
+
+    def feel(self) -> Grasp | Missed:
+        """The contacts now, without motion, whatever the hand does meanwhile: hold, press, carry.
+
+        The tips are as heavy as they were weighed at the last touch, turned as they turn. Each
+        contact has its wrench, the mean over FEELING. Raises InputError before the first touch.
+        """
+        if self._weighed is None:
+            raise InputError("PhysicalProbe.feel: nothing was touched yet; touch weighs the tips")
+        try:
+            return self._sense(self._weighed, self._wait(FEELING))
+        except _SilentError as what:
+            return Missed(Miss.SENSOR, str(what))
+
+    def _retreat(self, missed: Missed, way: Sequence[np.ndarray]) -> None:
+        """Go back to where the touch began, or to the last posture that was passed."""
+        if missed.reason is Miss.STUCK:
+            self._watch(PAUSE)
+        here = self._wait(0.0)
+        back = self._opened(here, way[-1])
+        # Nobody knows what a finger is at: it may be behind the object.
+        self._go(back, 2.0 * float(np.abs(back - here.q[-1]).max()) / SWIFT)
+        self._go(way[-2], MOVING)
+
+    def _wait(self, duration: float) -> Readings:
+        """Readings that tell something. Raises _SilentError."""
+        readings = self.driver.wait(duration)
+        mute = np.isnan(readings.wrench).any(axis=(0, 2))
+        if mute.any():
+            raise _SilentError(self._names[int(mute.argmax())])
+        return self._in_time(readings)
+
+    def _in_time(self, readings: Readings) -> Readings:
+        """The readings, if they are new and joints are known. Raises _SilentError."""
+        if not (np.diff(readings.time, prepend=self._clock) > 0.0).all():
+            raise _SilentError("all of the hand: its readings have time stamps that do not advance")
+        object.__setattr__(self, "_clock", float(readings.time[-1]))
+        mute = np.isnan(readings.q).any(axis=0)
+        if mute.any():
+            raise _SilentError(self.robot.joints[int(mute.argmax())])
+        return readings
+
+    @property
+    def _names(self) -> list[str]:
+        return [point.name for point in self.robot.description.contact_points]
 
     def _listen(self) -> Readings | Missed:
         """The newest readings, once no sensor is silent: a hand that feels nothing stays."""
         left = DEAF
         while True:
-            heard = self.driver.wait(LISTENING)
+            heard = self._in_time(self.driver.wait(LISTENING))
             silent = _silent(heard)
             left -= LISTENING
-            if not silent.any() or silent.all():
+            if not silent.any() or (silent.all() and not np.isnan(heard.wrench).any()):
                 return heard
             if left <= 0.0:
-                names = [point.name for point in self.robot.description.contact_points]
-                return Missed(Miss.SENSOR, names[int(silent.argmax())])
+                return Missed(Miss.SENSOR, self._names[int(silent.argmax())])
 
     def _away(self, q: np.ndarray) -> np.ndarray:
         """The posture q (n,) [rad], each finger opened by RETREAT."""
-        flexion, away = [j for (j,) in self.robot.flexion], q.copy()
-        away[flexion] = np.maximum(self.driver.limits.lower[flexion], q[flexion] - RETREAT)
-        return away
+        limits, closing = self.driver.limits, self.robot.closing.sum(axis=0)
+        opened = np.clip(q - RETREAT * closing, limits.lower, limits.upper)
+        return np.where(closing != 0.0, opened, q)
 
     def _opened(self, readings: Readings, away: np.ndarray) -> np.ndarray:
         """Where the hand is, each finger opened by RETREAT, and at least as far as in `away`."""
-        limits, flexion = self.driver.limits, [j for (j,) in self.robot.flexion]
+        limits, closing = self.driver.limits, self.robot.closing.sum(axis=0)
         q = np.clip(readings.q[-1], limits.lower, limits.upper)
-        opened = np.minimum(q[flexion] - RETREAT, away[flexion])
-        q[flexion] = np.maximum(limits.lower[flexion], opened)
-        return q
+        opened = q - RETREAT * closing
+        opened = np.where(closing > 0.0, np.minimum(opened, away), np.maximum(opened, away))
+        return np.where(closing != 0.0, np.clip(opened, limits.lower, limits.upper), q)
 
-    def _touch(self, way: Sequence[np.ndarray], expected: np.ndarray) -> Grasp | Missed:
+    def _touch(self, way: Sequence[np.ndarray], target: np.ndarray) -> Grasp | Missed:
         """Open to way[0], go along the others, and close."""
         for i, q in enumerate(way):
             fault = self._go(q, MOVING if i else OPENING)
@@ -141,11 +184,13 @@ class PhysicalProbe:
                 heard = self._listen()
                 reason = Miss.BLOCKED if i else Miss.STUCK
                 return heard if isinstance(heard, Missed) else Missed(reason, fault)
-        self.driver.wait(RESTING)
-        free = self.driver.wait(WEIGHING)
+        self._wait(RESTING)
+        free = self._wait(WEIGHING)
+        object.__setattr__(self, "_weighed", free)
         noise = np.sqrt(self._variance(free)[:, :3].sum(axis=1))
-        noticed = np.maximum(NOTICED, BEYOND_NOISE * noise).tolist()
-        missed = self._close(self._approach(free, expected, noticed), noticed)
+        noticed = np.maximum(NOTICED, BEYOND_NOISE * noise)
+        noticed = np.minimum(noticed, self.driver.limits.hold).tolist()
+        missed = self._close(self._approach(free, target, noticed), noticed)
         if missed is not None:
             return missed
         self.driver.hold(self.force)
@@ -159,59 +204,63 @@ class PhysicalProbe:
         left, weighed = SETTLING + PRESSING * self.force, self._steady(free)[:, :3]
         best, most = None, -1.0
         while best is None or left > 0.0:
-            held = self.driver.wait(PRESSED)
+            held = self._wait(PRESSED)
             left -= PRESSED
             pressed = np.linalg.norm(self._steady(held)[:, :3] - weighed, axis=1)
             if held.fault:
                 return held
             if (np.abs(pressed - self.force) <= SETTLED * self.force).all():
-                return self.driver.wait(SENSING)
+                return self._wait(SENSING)
             if pressed.min() > most:
                 best, most = held, float(pressed.min())
         return best
 
     def _go(self, q: np.ndarray, duration: float) -> str:
         """Move there; return what stopped the hand on its way, empty if nothing did."""
-        left = self.driver.move(q, duration)
+        left, still = self.driver.move(q, duration), True
+        far = 0.0
         while left > 0.0:
             slice_ = min(left, 0.5 * self.driver.limits.watchdog)
-            fault = self.driver.wait(slice_).fault
-            if fault:
-                return fault
+            readings = self._wait(slice_)
+            if readings.fault:
+                return readings.fault
+            still = still and not np.ptp(readings.q, axis=0).any()
+            far = max(far, float(np.abs(q - readings.q[0]).max()))
             left -= slice_
+        if still and far > CLOSED:
+            raise _SilentError("all of the hand: it was sent elsewhere and reads the same angles")
         return ""
 
     def _approach(
-        self, readings: Readings, expected: np.ndarray, noticed: Sequence[float]
+        self, readings: Readings, target: np.ndarray, noticed: Sequence[float]
     ) -> Readings:
         """Close all fingers swiftly, to a little before the touch that is expected."""
-        driver, flexion = self.driver, [j for (j,) in self.robot.flexion]
-        way = np.maximum(expected - EXPECTED - readings.q[-1][flexion], 0.0)
+        closing = self.robot.closing
+        away = closing @ (target - readings.q[-1]) / (closing**2).sum(axis=1)
+        way = np.maximum(away - EXPECTED, 0.0)
         swift = float(way.max()) / SWIFT
         if swift > 0.0:
             for i, length in enumerate(way):
                 if length > 0.0:
-                    driver.close(i, length / swift, noticed[i])
-            readings = self._watch(driver, swift)
+                    self.driver.close(i, length / swift, noticed[i])
+            readings = self._watch(swift)
         return readings
 
     def _close(self, readings: Readings, noticed: Sequence[float]) -> Missed | None:
         """Close what has not touched until `noticed` (k,) [N] is felt; None once all have."""
-        driver, limits = self.driver, self.driver.limits
-        flexion = [j for (j,) in self.robot.flexion]
-        names = [point.name for point in self.robot.description.contact_points]
+        driver, names = self.driver, self._names
         careful = 2.0 * EXPECTED / CAREFUL
         speed = CAREFUL
         for i in np.flatnonzero(~readings.touched).tolist():
             driver.close(i, speed, noticed[i])
-        left = PATIENCE + float((limits.upper[flexion] - readings.q[-1][flexion]).max()) / SLOW
+        left = PATIENCE + float(self._open_by(readings).max()) / SLOW
         while not readings.fault and not readings.touched.all():
             if readings.stalled.any():
                 driver.stop()
                 i = int(np.argmax(readings.stalled))
                 silent = _silent(readings)[i]
                 return Missed(Miss.SENSOR if silent else Miss.OTHER_LINK, names[i])
-            closed = readings.q[-1][flexion] >= limits.upper[flexion] - CLOSED
+            closed = self._open_by(readings) <= CLOSED
             closed |= left <= 0.0  # a finger that takes longer than its range does not close
             if (closed & ~readings.touched).any():
                 driver.stop()
@@ -220,23 +269,30 @@ class PhysicalProbe:
                 speed = SLOW
                 for i in np.flatnonzero(~readings.touched).tolist():
                     driver.close(i, speed, noticed[i])
-            readings = driver.wait(POLL)
+            readings = self._wait(POLL)
             careful, left = careful - POLL, left - POLL
         return Missed(Miss.BLOCKED, readings.fault) if readings.fault else None
 
-    @staticmethod
-    def _watch(driver: Driver, duration: float) -> Readings:
+    def _open_by(self, readings: Readings) -> np.ndarray:
+        """How far (k,) [rad] each finger can still close, until its last joint is at its end."""
+        closing, limits = self.robot.closing, self.driver.limits
+        end = np.where(closing > 0.0, limits.upper, limits.lower)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = (end - readings.q[-1]) / closing
+        return np.asarray(np.where(closing != 0.0, left, -np.inf).max(axis=1))
+
+    def _watch(self, duration: float) -> Readings:
         """Wait, in slices that the watchdog allows, while nothing stops the hand."""
         while True:
-            slice_ = min(duration, 0.5 * driver.limits.watchdog)
-            readings = driver.wait(slice_)
+            slice_ = min(duration, 0.5 * self.driver.limits.watchdog)
+            readings = self._wait(slice_)
             duration -= slice_
             if duration <= 0.0 or readings.fault or readings.stalled.any():
                 return readings
 
     def _sense(self, free: Readings, held: Readings) -> Grasp | Missed:
         robot = self.robot
-        names = [point.name for point in robot.description.contact_points]
+        names = self._names
         if held.fault:
             return Missed(Miss.BLOCKED, held.fault)
         silent = _silent(held)
@@ -302,10 +358,17 @@ class PhysicalProbe:
         return np.asarray(beside <= np.maximum(SPIKE * self.force, np.median(beside, axis=0)))
 
 
+class _SilentError(Exception):
+    """Readings say nothing; of what, its message tells."""
+
+
 def _silent(readings: Readings) -> np.ndarray:
-    """Tips (k,) that say the same to the last bit in three samples running, as none in use does."""
+    """Tips (k,) that say nothing, or the same to the last bit in three samples running.
+
+    No sensor in use does.
+    """
     same = (np.diff(readings.wrench, axis=0) == 0.0).all(axis=2)
-    return (same[1:] & same[:-1]).any(axis=0)
+    return np.asarray((same[1:] & same[:-1]).any(axis=0) | np.isnan(readings.wrench).any((0, 2)))
 
 
 def _own_links(robot: Robot) -> tuple[tuple[int, list[int]], ...]:

@@ -11,11 +11,11 @@ from mujoco.rollout import Rollout
 
 from hqp_grasp.errors import InputError, instance, one_of, positive
 from hqp_grasp.grasp import Contact, Grasp
-from hqp_grasp.touch.driver import DriverLimits, Readings
+from hqp_grasp.touch.driver import PRESS_RATE, DriverLimits, Readings
 from hqp_grasp.touch.geometric import OVERLAP, RETREAT
 from hqp_grasp.world.imperfections import SensorErrors
 from hqp_grasp.world.objects import OBJECT
-from hqp_grasp.world.physics import Physics, foot, round_tips, servos, simulated_model
+from hqp_grasp.world.physics import NOSLIP, Physics, foot, round_tips, servos, simulated_model
 from hqp_grasp.world.scene import Scene
 
 SAMPLING = 0.01  # [s] between readings
@@ -31,11 +31,14 @@ FORCE_GAIN = 0.5  # share of the force's error that one cycle of holding takes a
 HOLDING_SPEED = 0.3  # [rad/s] that holding corrects by, at most
 LEAD = 2.0  # times the servo's give at the held force, by which a target leads its joint at most
 GUARD = 0.6  # share of the force limit at which the driver stops
+GRIP_GUARD = 0.9  # the same of the grip's: it grows slowly, for PRESS_RATE bounds it
 MARGIN = 5e-3  # [rad] from the ends of its range a joint turns back: servos swing over
 BRAKING = 0.06  # [s] a stop takes, all joints together: one that stands while others move may press
 SILENT = 5  # samples of the fast loop, the same to the last bit, after which a sensor is dead
 STARTLE = 1.0  # [N] more than at its beginning, a move in free air stops: a bump has momentum
-PRESS = 0.4  # share of the force limit that is held, at most
+FOLLOWED = 0.05  # share of the largest torque asked to which every joint follows its own
+RESISTING = 0.5  # share of its torque below which a pressed joint meets nothing that resists
+GIVING = 0.3  # [s] after which such a joint stops the hand
 MOVING, REACTING = 0.4, 0.05  # [s] in one call of the simulator, and while fingers press
 IDLE, CLOSING, HOLDING = 0, 1, 2
 
@@ -72,6 +75,7 @@ class SimulatedHand:
         rng: np.random.Generator | None = None,
         force_limit: float = 15.0,  # [N] as the BarrettHand presses
         watchdog: float = 1.0,  # [s]
+        grip_limit: float = 20.0,  # [N] as the BarrettHand bears
     ) -> None:
         instance("SimulatedHand.scene", scene, Scene)
         one_of("links", links, ("pass", "block"))
@@ -83,7 +87,7 @@ class SimulatedHand:
         about, timestep = physics.imperfections, physics.timestep
         self.robot = scene.articulated
         k, n = len(self.robot.flexion), self.robot.n
-        self._flexion = np.array([_only(point) for point in self.robot.flexion])
+        self._closing = self.robot.closing  # (k, n)
         self._free = physics.support != "fixed"
         self.table = foot(scene)[0] if physics.support == "table" else None  # [m] its height
         self.model = simulated_model(scene, physics, links)
@@ -107,6 +111,7 @@ class SimulatedHand:
         self._q[self._driven] = [1 + model.joint(j).qposadr[0] for j in driven]
         self._v[self._driven] = [1 + model.nq + model.joint(j).dofadr[0] for j in driven]
         self._servo = servos(model, driven)
+        self._damping = model.actuator_biasprm[:, 2].copy()
         self._kp, self._lag = np.ones(n), np.zeros(n)
         self._kp[self._driven] = kp = model.actuator_gainprm[self._servo, 0]
         self._lag[self._driven] = (
@@ -129,17 +134,25 @@ class SimulatedHand:
         self._torque = slice(first, first + len(driven))
         torque = robot.model.actuator_forcerange[servos(robot.model, robot.joints), 1]
         self.limits = DriverLimits(
-            robot.q_lower, robot.q_upper, robot.velocity, torque, force_limit, watchdog
+            robot.q_lower,
+            robot.q_upper,
+            robot.velocity,
+            torque,
+            force_limit,
+            watchdog,
+            grip_limit,
         )
         self._lower, self._upper = robot.q_lower + MARGIN, robot.q_upper - MARGIN
         self.rate = 1.0 / (self._every * timestep)
         self._rng = rng
-        self._arm = np.isin(robot.joints, robot.description.arm)
+        self._arm = np.isin(np.arange(n), robot.arm)
+        self._fingers = np.flatnonzero(~self._arm & ~robot.idle)  # joints that press
         self._errors = SensorErrors(about, k, self._arm, self._rng)
         self._late = round(about.latency / timestep)
         self.simulated = 0  # steps in all
         # The largest of each since the hand was made, at any step.
         self.worst = {"range [rad]": 0.0, "speed share": 0.0, "torque share": 0.0, "force [N]": 0.0}
+        self._asked: np.ndarray | None = None  # (f,) [N·m] of the fingers' joints, while pressing
         self.place(robot.home)
 
     # ------------------------------------------------------------ what only a simulation can
@@ -152,9 +165,10 @@ class SimulatedHand:
         """
         robot, model, data = self.robot, self.model, self._data
         q = np.clip(robot.require_q("SimulatedHand.place: q", q), self._lower, self._upper)
-        q[self._flexion] = np.maximum(self._lower[self._flexion], q[self._flexion] - RETREAT)
+        self._release()
+        q = np.clip(q - RETREAT * self._closing.sum(axis=0), self._lower, self._upper)
         if self._put(q):
-            q[self._flexion] = self._lower[self._flexion]
+            q = np.clip(robot.opened(q), self._lower, self._upper)
             inside = self._put(q)
             if inside:
                 raise InputError(
@@ -171,14 +185,17 @@ class SimulatedHand:
         self._braking = 0  # steps left
         k = len(self._tips)
         self._mode = [IDLE] * k
-        self._speed = [0.0] * k  # [rad/s] asked
-        self._now = [0.0] * k  # [rad/s] of the closing target
+        self._speed = [0.0] * k  # [1/s] asked, along `closing`
+        self._now = [0.0] * k  # [1/s] of the target along `closing`
         self._force = [0.0] * k  # [N] that ends closing, or is held
         self._aim = [0.0] * k  # [N] that holding follows now
-        self._give = [0.0] * k  # [rad/N] of the servo at the tip
+        self._give = [0.0] * k  # of the servos at the tip, along `closing` [1/N]
         self._zero = np.zeros((k, 3))  # [N] at the call of `close`
         self._touched, self._stalled = np.zeros(k, bool), np.zeros(k, bool)
         self._guard = np.full(k, GUARD * self.limits.force)  # [N] at which the hand stops
+        self._followed = np.zeros(len(self._fingers))  # (f,) [N·m] of it, by now
+        self._motors = np.zeros(len(q))  # (n,) [N·m] lately
+        self._giving = np.zeros(len(self._fingers))  # [s] without resistance
         self._fault = ""
         still = -data.sensordata[self._wrench].reshape(1, k, 6)
         self._tail = np.repeat(still, self._late, axis=0)
@@ -261,6 +278,24 @@ class SimulatedHand:
         """See Driver."""
         q = self.robot.require_q("SimulatedHand.move: q", q)
         positive("SimulatedHand.move: duration", duration)
+        self._release()
+        steps = self._start(q, duration)
+        self._rest()
+        self._guard = np.minimum(self._guard, np.linalg.norm(self._middle(), axis=1) + STARTLE)
+        return steps * self._dt
+
+    def carry(self, q: np.ndarray, duration: float) -> float:
+        """See Driver."""
+        q = self.robot.require_q("SimulatedHand.carry: q", q)
+        positive("SimulatedHand.carry: duration", duration)
+        if self._asked is None:
+            if self._fault:
+                return 0.0
+            raise InputError("SimulatedHand.carry: the hand presses nothing; call press first")
+        return self._start(np.where(self._arm, q, self._goal), duration) * self._dt
+
+    def _start(self, q: np.ndarray, duration: float) -> int:
+        """Start a ramp to q (n,) [rad]; return its steps."""
         to = np.clip(q + self._errors.miss(len(q)), self._lower, self._upper)
         least = np.abs(to - self._goal) / (SPEED_SHARE * self.limits.speed)
         carried = np.where(self._arm, to - self._goal, 0.0)
@@ -269,47 +304,87 @@ class SimulatedHand:
         least = PEAK * max(least.max(), way.max() / CARRY_SPEED)
         steps = int(np.ceil(max(duration, least) / self._dt))
         self._ramp, self._braking = (self._goal.copy(), to, 0, steps), 0
-        self._rest()
-        self._guard = np.minimum(self._guard, np.linalg.norm(self._middle(), axis=1) + STARTLE)
         self._fault = ""
-        return steps * self._dt
+        return steps
 
     def close(self, finger: int, speed: float, force: float) -> None:
         """See Driver."""
         if not 0 <= finger < len(self._tips):
             raise InputError(f"no finger {finger}; there are {len(self._tips)}, from 0 on")
         positive("SimulatedHand.close: speed", speed)
-        positive("SimulatedHand.close: force", force)
+        self.limits.require_hold("SimulatedHand.close: force", force)
+        self._release()
         self._fault = ""
         self._ramp, self._braking = None, 0
         self._guard[:] = GUARD * self.limits.force
-        j = self._flexion[finger]
         if self._mode[finger] != CLOSING:
             self._zero[finger] = np.median(self._last[:, finger, :3], axis=0)
             self._now[finger] = 0.0
         self._mode[finger] = CLOSING
-        self._speed[finger] = min(speed, SPEED_SHARE * self.limits.speed[j])
-        self._force[finger] = min(force, PRESS * self.limits.force)
+        share = np.abs(self._closing[finger]) / self.limits.speed
+        self._speed[finger] = min(speed, SPEED_SHARE / float(share.max()))
+        self._force[finger] = force
         self._touched[finger] = self._stalled[finger] = False
 
     def hold(self, force: float) -> None:
         """See Driver."""
-        positive("SimulatedHand.hold: force", force)
+        self.limits.require_hold("SimulatedHand.hold: force", force)
         for i, mode in enumerate(self._mode):
             if mode == HOLDING:
-                self._force[i] = min(force, PRESS * self.limits.force)
+                self._force[i] = force
+
+    def press(self, torque: np.ndarray) -> None:
+        """See Driver."""
+        torque = self.limits.require_torque("SimulatedHand.press: torque", torque, self.robot.arm)
+        if self._asked is None:
+            if self._ramp is not None:
+                self.stop()
+            self._mode, self._now = [IDLE] * len(self._mode), [0.0] * len(self._mode)
+            self._followed = self._motors[self._fingers]
+            self._giving[:] = 0.0
+            self._guard[:] = GRIP_GUARD * self.limits.grip
+            self._damp(self.limits.torque / (SPEED_SHARE * self.limits.speed))
+            self.model.opt.noslip_iterations = NOSLIP
+            self._fault = ""
+        self._asked = torque[self._fingers]
+
+    def _damp(self, least: np.ndarray | float) -> None:
+        """Give the fingers' servos their damping, and `least` (n,) [N·m·s/rad] where it is more.
+
+        With the torque limit by the speed limit no joint is faster than that, whatever it loses.
+        """
+        servos = self._servo[np.isin(self._driven, self._fingers)]
+        own = self._damping[servos]
+        most = np.broadcast_to(least, self._kp.shape)[self._fingers]
+        self.model.actuator_biasprm[servos, 2] = np.minimum(own, -most)
+
+    def _release(self) -> None:
+        """Press no more: the fingers stand where they are."""
+        if self._asked is None:
+            return
+        self._asked = None
+        self._damp(0.0)
+        self.model.opt.noslip_iterations = 0
+        self._goal[self._fingers] = self._measured()[self._fingers]
+        self._goal = np.clip(self._goal, self._lower, self._upper)
+        self._guard[:] = GUARD * self.limits.force
 
     def stop(self) -> None:
         """See Driver."""
         if self._going.any() and not any(self._mode):
             self._braking = self._braking or round(BRAKING / self._dt)
         self._ramp = None
+        self._release()
         self._rest()
         if not self._braking:
             self._stand()
 
     def _stand(self) -> None:
-        self._goal = np.clip(self._measured(), self._lower, self._upper)
+        """Where the joints are is where they shall be, but for those that press."""
+        here = np.clip(self._measured(), self._lower, self._upper)
+        if self._asked is not None:
+            here[self._fingers] = self._goal[self._fingers]
+        self._goal = here
 
     def wait(self, duration: float) -> Readings:
         """See Driver."""
@@ -319,7 +394,7 @@ class SimulatedHand:
         left, silence = intervals * self._every, round(self.limits.watchdog / self._dt)
         states, felt, torques, true = [], [], [], []
         while left:
-            if silence == 0 and (self._ramp or any(self._mode)):
+            if silence == 0 and (self._ramp or self._reacts):
                 self.stop()
                 self._fault = f"watchdog: no call for {self.limits.watchdog:g} s"
             T = min(left, silence or left, self._chunk())
@@ -328,7 +403,7 @@ class SimulatedHand:
             wrench = -sensors[:, self._wrench].reshape(T, -1, 6)
             late = np.concatenate([self._tail, wrench]) if self._late else wrench
             reading = self._errors.wrench(state[:, 0], late[:T])
-            done = self._react(state, reading)
+            done = self._react(state, reading, sensors[:, self._torque])
             self._state = state[done - 1].copy()
             if self._late:
                 self._tail = late[done : done + self._late]
@@ -345,10 +420,15 @@ class SimulatedHand:
 
     # ------------------------------------------------------------ the fast loop
 
+    @property
+    def _reacts(self) -> bool:
+        """True while a finger closes, holds or presses."""
+        return any(self._mode) or self._asked is not None
+
     def _chunk(self) -> int:
         if self._braking:
             return self._braking
-        return math.ceil((REACTING if any(self._mode) else MOVING) / self._dt)
+        return math.ceil((REACTING if self._reacts else MOVING) / self._dt)
 
     def _plan(self, T: int) -> np.ndarray:
         """Targets of the servos (T, nu) over the next steps; moves the goal along."""
@@ -366,20 +446,23 @@ class SimulatedHand:
             goal += speed.cumsum(axis=0) * self._dt
         closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
         if closing:
-            j = self._flexion[closing]
+            W = self._closing[closing]
             now, wanted = np.array(self._now)[closing], np.array(self._speed)[closing]
             gain = (CLOSING_ACCELERATION * self._dt * after)[:, None]
             v = now + np.minimum(np.maximum(wanted - now, -gain), gain)
-            speed[:, j] = v
-            goal[:, j] = np.minimum(goal[0, j] + v.cumsum(axis=0) * self._dt, self._upper[j])
+            speed += v @ W
+            ahead = goal[0] + (v.cumsum(axis=0) * self._dt) @ W
+            goal = np.where(W.any(axis=0), np.clip(ahead, self._lower, self._upper), goal)
         if HOLDING in self._mode:
             felt = self._middle() - self._zero
             q, share = self._measured(), after / T
             for i, mode in enumerate(self._mode):
                 if mode == HOLDING:
-                    j = self._flexion[i]
-                    correction = self._correction(i, math.hypot(*felt[i]), float(q[j]), T)
-                    goal[:, j] += correction * share
+                    goal += share[:, None] * self._correction(i, math.hypot(*felt[i]), q, T)
+        if self._asked is not None:
+            j = self._fingers
+            goal[:, j] = self._goal[j] + (after / T)[:, None] * self._pressing(T)
+            speed[:, j] = 0.0
         ctrl = np.zeros((T, self.model.nu))
         told = goal - self._errors.encoder_offset
         slack = self._errors.about.backlash / 2.0
@@ -389,23 +472,48 @@ class SimulatedHand:
                 play = np.clip(play, told[t] - slack, told[t] + slack)
                 told[t] = play
         for i in self._errors.stalled(float(self._state[0])):
-            j = self._flexion[i]
+            j = self._closing[i] != 0.0
             told[:, j], speed[:, j] = self._play[j], 0.0
         ctrl[:, self._servo] = (told + self._lag * speed)[:, self._driven]
         self._planned = goal, speed, told
         return ctrl
 
-    def _correction(self, i: int, felt: float, q: float, T: int) -> float:
-        """How far holding moves finger i's target over the next T steps [rad]."""
-        j, give = self._flexion[i], self._give[i]
+    def _correction(self, i: int, felt: float, q: np.ndarray, T: int) -> np.ndarray:
+        """How far (n,) [rad] holding moves finger i's target over the next T steps."""
+        give, way = self._give[i], self._closing[i]
         change = _within(self._force[i] - self._aim[i], FORCE_RATE * T * self._dt)
         self._aim[i] += change
         wanted = give * (0.5 * change + FORCE_GAIN * (self._aim[i] - felt))
-        now = float(self._goal[j])
-        goal = now + _within(wanted, HOLDING_SPEED * T * self._dt)
-        # However little a broken sensor says, the servo's own error bounds the force.
-        most = min(q + LEAD * give * self._force[i] + STALL, float(self._upper[j]))
-        return max(min(goal, most), float(self._lower[j])) - now
+        goal = self._goal + way * _within(wanted, HOLDING_SPEED * T * self._dt)
+        # However little a broken sensor says, the servos' own error bounds the force.
+        most = q + way * (LEAD * give * self._force[i] + STALL)
+        goal = np.where(way > 0.0, np.minimum(goal, most), np.maximum(goal, most))
+        return np.where(way != 0.0, np.clip(goal, self._lower, self._upper) - self._goal, 0.0)
+
+    def _pressing(self, T: int) -> np.ndarray:
+        """How far (f,) [rad] pressing moves the fingers' targets over the next T steps.
+
+        In between the servos are springs: they hold what is pressed where torques alone let it go.
+        """
+        assert self._asked is not None
+        j, most = self._fingers, PRESS_RATE * T * self._dt
+        change = np.clip(self._asked - self._followed, -most, most)
+        missing = self._followed - self._motors[j]
+        missing[np.abs(missing) <= self._slack] = 0.0
+        self._followed = self._followed + change
+        wanted = np.clip(change + FORCE_GAIN * missing, -most, most) / self._kp[j]
+        fast = SPEED_SHARE * self.limits.speed[j] * T * self._dt
+        goal = self._goal[j] + np.clip(wanted, -fast, fast)
+        lead = LEAD * (np.abs(self._followed) + self._slack) / self._kp[j]
+        q = self._measured()[j]
+        goal = np.clip(goal, q - lead, q + lead)
+        return np.clip(goal, self._lower[j], self._upper[j]) - self._goal[j]
+
+    @property
+    def _slack(self) -> float:
+        """What pressed joints may be off what is asked of them [N·m]."""
+        assert self._asked is not None
+        return FOLLOWED * float(np.abs(self._asked).max(initial=0.0))
 
     def _run(self, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Simulate; states (T, ·) after each step, and sensors (T, ·) during it."""
@@ -430,7 +538,7 @@ class SimulatedHand:
             return np.concatenate([states[0], standing], axis=1), sensors[0]
         return states[0], sensors[0]
 
-    def _react(self, state: np.ndarray, wrench: np.ndarray) -> int:
+    def _react(self, state: np.ndarray, wrench: np.ndarray, motors: np.ndarray) -> int:
         """See what happened first in these steps, act on it; return how many steps stand."""
         T = len(state)
         goal, speed, told = self._planned
@@ -446,15 +554,17 @@ class SimulatedHand:
         behind = goal - self._errors.encoder_offset - state[:, self._q]
         closing = [i for i, mode in enumerate(self._mode) if mode == CLOSING]
         if closing:
-            j = self._flexion[closing]
             change = _squares(force[:, closing] - self._zero[closing])
             touched = change > np.array(self._force)[closing] ** 2
-            stuck = behind[:, j] > STALL + 0.5 * self._lag[j] * speed[:, j]
+            ahead = self._closing[closing]
+            late = STALL + 0.5 * self._lag * np.abs(speed)
+            slow = behind[:, None] * np.sign(ahead) > late[:, None]
+            stuck = (slow & (ahead != 0.0)).any(axis=2)
             for kind, happens in (("touch", _twice(touched)), ("stall", stuck)):
                 if happens[:first].any():
                     first = int(np.argmax(happens.any(axis=1)))
                     what = (kind, closing[int(np.argmax(happens[first]))])
-        if not any(self._mode) and speed.any():
+        if not self._reacts and speed.any():
             dead = (wrench[1:] == wrench[:-1]).all(axis=2)
             for _ in range(SILENT - 2):
                 dead = dead[1:] & dead[:-1]
@@ -464,6 +574,11 @@ class SimulatedHand:
                 what = ("silent", int(np.argmax(dead[first])))
                 first += SILENT - 1
         beside = np.abs(behind)
+        # What presses is beside its target, and bounded otherwise.
+        holding = [mode == HOLDING for mode in self._mode]
+        beside[:, self._closing[holding].any(axis=0)] = 0.0
+        if self._asked is not None:
+            beside[:, self._fingers] = 0.0
         if beside[:first].max(initial=0.0) > FOLLOWING:
             first = int(np.argmax((beside > FOLLOWING).any(axis=1)))
             what = ("held", int(beside[first].argmax()))
@@ -477,7 +592,11 @@ class SimulatedHand:
                 self._state = state[done - 1].copy()
                 self._stand()
         for i in range(len(self._mode)):
-            self._now[i] = float(speed[done - 1, self._flexion[i]])
+            way = self._closing[i]
+            self._now[i] = float(speed[done - 1] @ way / (way @ way)) if self._mode[i] else 0.0
+        self._motors[self._driven] = motors[done - 1]
+        if self._asked is not None and what is None:
+            what = self._runaway(done)
         if what is None:
             return done
         kind, i = what
@@ -486,6 +605,10 @@ class SimulatedHand:
             self.stop()
             held = f"something holds {self.robot.joints[i]}: it does not follow"
             self._fault = self._fault or held
+        elif kind == "runaway":
+            self.stop()
+            meets = f"{self.robot.joints[i]} meets nothing that resists what it presses with"
+            self._fault = self._fault or meets
         elif kind == "silent":
             name = self.robot.description.contact_points[i].name
             self.stop()
@@ -500,8 +623,16 @@ class SimulatedHand:
             self._mode[i] = IDLE
             self._now[i] = 0.0
             self._stalled[i] = True
-            self._goal[self._flexion[i]] = self._measured()[self._flexion[i]]
+            self._goal = np.where(self._closing[i] != 0.0, self._measured(), self._goal)
         return done
+
+    def _runaway(self, steps: int) -> tuple[str, int] | None:
+        """A joint that pressed for GIVING without resistance, after `steps` more."""
+        j, aim = self._fingers, self._followed
+        firm = self._motors[j] * np.sign(aim) >= RESISTING * np.abs(aim) - self._slack
+        self._giving = np.where(firm, 0.0, self._giving + steps * self._dt)
+        worst = int(self._giving.argmax())
+        return ("runaway", int(j[worst])) if self._giving[worst] > GIVING else None
 
     def _middle(self) -> np.ndarray:
         """Force (k, 3) [N] at the tips lately: the median, for a spike is nothing."""
@@ -509,13 +640,14 @@ class SimulatedHand:
         return np.sort(lately, axis=0)[len(lately) // 2]
 
     def _begin_holding(self, i: int) -> None:
-        j = self._flexion[i]
-        q = self._measured()
-        J = self.robot.jacobian(np.clip(q, self._lower, self._upper))
-        self._give[i] = float(np.linalg.norm(J[3 * i : 3 * i + 3, j]) / self._kp[j])
+        q, way = self._measured(), self._closing[i]
+        J = self.robot.jacobian(np.clip(q, self._lower, self._upper))[3 * i : 3 * i + 3]
+        # A force F along the tip's way does F |J w| of work by closing's unit; so do the servos.
+        self._give[i] = float(np.linalg.norm(J @ way) / (self._kp @ (way * way)))
         self._mode[i], self._touched[i], self._now[i] = HOLDING, True, 0.0
         self._aim[i] = self._force[i]
-        self._goal[j] = min(q[j] + self._give[i] * self._force[i], self._upper[j])
+        ahead = np.clip(q + way * (self._give[i] * self._force[i]), self._lower, self._upper)
+        self._goal = np.where(way != 0.0, ahead, self._goal)
 
     def _measured(self) -> np.ndarray:
         return self._errors.joints(self._state[self._q])
@@ -541,6 +673,8 @@ class SimulatedHand:
         ):
             self.worst[name] = max(self.worst[name], float(value))
         at = slice(self._every - 1, None, self._every)
+        motors = np.zeros_like(q[at])
+        motors[:, self._driven] = torques[at]
         return Readings(
             time=states[at, 0],
             q=q[at],
@@ -549,6 +683,7 @@ class SimulatedHand:
             touched=self._touched,
             stalled=self._stalled,
             fault=self._fault,
+            torque=motors,
         )
 
 
@@ -568,11 +703,3 @@ def _twice(above: np.ndarray) -> np.ndarray:
     both[1:] &= above[:-1]
     both[:1] = False
     return both
-
-
-def _only(flexion: tuple[int, ...]) -> int:
-    if len(flexion) != 1:
-        raise InputError(
-            f"a finger has {len(flexion)} flexion joints; the simulated hand closes one a finger"
-        )
-    return flexion[0]

@@ -166,9 +166,25 @@ class NeverTouches(Broken):
         return replace(readings, touched=np.zeros(3, bool))
 
 
-class PressesTooHard(Broken):
+class HoldsTooHard(Broken):
     def hold(self, force):
-        self.hand.hold(1.5 * force)
+        self.hand.hold(min(1.5 * force, 6.0))
+
+
+class HoldsNoMoreThanLittle(Broken):
+    def hold(self, force):
+        self.hand.hold(min(force, 2.0))
+
+
+class GripsInsteadOfHolding(Broken):
+    """Claims a limit of 5 N, and cuts what is asked for at 6."""
+
+    def __init__(self, hand):
+        super().__init__(hand)
+        self.limits = replace(hand.limits, force=5.0)
+
+    def hold(self, force):
+        self.hand.hold(min(force, 6.0))
 
 
 def test_the_simulated_hand_keeps_the_contract(scene, grasp):
@@ -197,10 +213,11 @@ def test_a_hand_with_the_imperfections_of_a_real_one_keeps_it_too(scene, grasp):
         (lambda hand: Limitless(hand, watchdog=0.2), "the watchdog of 0.2 s does not stop"),
         (lambda hand: Limitless(hand, speed=0.2 * hand.limits.speed), "limits not held: .* rad/s"),
         (lambda hand: Limitless(hand, lower=hand.limits.lower + 0.05), "beyond its range"),
-        (lambda hand: Limitless(hand, force=1.5), "limits not held: a fingertip felt"),
+        (GripsInsteadOfHolding, "limits not held: a fingertip felt"),
+        (HoldsNoMoreThanLittle, "was asked for 6 N, which may be asked for, and reads"),
         (SilentWatchdog, "Readings.fault does not say so"),
         (NeverTouches, "does not end at a touch"),
-        (PressesTooHard, "was asked for 1 N"),
+        (HoldsTooHard, "was asked for 1 N"),
     ],
 )
 def test_a_broken_driver_is_refused_by_the_name_of_its_fault(scene, grasp, broken, says):
