@@ -335,7 +335,7 @@ def test_a_driver_that_cannot_press_may_touch_and_is_told_apart(scene):
     hand.place(BALANCED)
     only = Touches(hand, *TOUCHING)
     assert isinstance(hg.PhysicalProbe(only, scene.articulated).touch(BALANCED), hg.Grasp)
-    with pytest.raises(hg.InputError, match="my hand cannot press: .* lacks press, carry"):
+    with pytest.raises(hg.InputError, match=r"my hand cannot press: .* lacks press, carry"):
         require_press("my hand", only)
     with pytest.raises(hg.InputError, match=r"cannot press: its DriverLimits\.grip is 0 N"):
         require_press("my hand", hg.SimulatedHand(scene, grip_limit=0.0))
