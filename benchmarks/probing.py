@@ -103,7 +103,7 @@ def growth(robots: tuple[str, ...], joints: tuple[int, ...], seed: int, solver: 
                 probe = TimedProbe(GeometricProbe(began.scene))
                 placed = hg.Trial(began.scene, trial.stack, 20, start=began.grasp)
                 record = placed.attempt((seed, 0), probe)
-            stack = trial.controller(scene, 0).stack
+            stack = trial.controller(scene).stack
             assert isinstance(stack, hg.Stack)
             hqp = hg.HQP(solver, rank_tolerance=TOUCH_RANK)
             levels = [stack.levels(grasp) for grasp in record.grasps]

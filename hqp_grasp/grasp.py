@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, instance, not_negative, number
+from hqp_grasp.errors import InputError, instance, not_negative
 
 UNIT_NORMAL_TOLERANCE = 1e-6  # | ‖n‖ − 1 | accepted in a sensed normal
 
@@ -38,18 +38,16 @@ class Contact:
     """One place where the hand touches the object.
 
     Everything after `normal` is optional: a law that needs it says so. A contact belongs to a
-    body, not to a finger: any link of any robot can hold one.
+    contact point, not to a finger: any link of any robot can have one.
     """
 
     position: np.ndarray  # (3,) [m], world
     normal: np.ndarray  # (3,) unit, outward from the object, world
     name: str = ""  # the robot's contact point that touches
-    body: str = ""  # the link it belongs to
-    point: np.ndarray | None = None  # (3,) [m], body frame: the point whose motion `jacobian` gives
+    point: np.ndarray | None = None  # (3,) [m], link frame: the point whose motion `jacobian` gives
     flexion: tuple[int, ...] = ()  # γ_i: indices into q of the joints that press this contact
     tip_radius: float = 0.0  # [m] from `point` to the touching surface; 0 for a material point
     wrench: np.ndarray | None = None  # (6,) force [N], torque [N·m] on the tip, when sensed
-    confidence: float = 1.0  # 0 … 1
     noise: float = 0.0  # [rad] standard error of `normal` about each axis across it, when sensed
 
     def __post_init__(self) -> None:
@@ -72,9 +70,6 @@ class Contact:
             ) from error
         for name in ("tip_radius", "noise"):
             set_field(self, name, not_negative(f"Contact.{name}", getattr(self, name)))
-        set_field(self, "confidence", number("Contact.confidence", self.confidence))
-        if not 0.0 <= self.confidence <= 1.0:
-            raise InputError(f"Contact.confidence must lie in [0, 1]; got {self.confidence}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,18 +9,29 @@ from pathlib import Path
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.errors import ResultsError
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 
+FORMER = ("body", "confidence")  # of contacts in older files; nothing ever read them
 GRASP = ("q", "jacobian", "hessian", "coupling", "offset")
 
 
 def save_history(path: str | Path, history: Sequence[Touch]) -> None:
-    """Write `history` as JSON, whole or not at all; numbers keep their bits."""
+    """Write `history` as JSON, whole or not at all; numbers keep their bits.
+
+    Raises ResultsError where the file cannot be written.
+    """
     path = Path(path)
     part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps([_plain(touch) for touch in history]))
-    part.replace(path)
+    text = json.dumps([_plain(touch) for touch in history])
+    try:
+        try:
+            part.write_text(text)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise ResultsError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def load_history(path: str | Path) -> tuple[Touch, ...]:
@@ -28,7 +39,9 @@ def load_history(path: str | Path) -> tuple[Touch, ...]:
     try:
         touches = json.loads(Path(path).read_text())
         return tuple(_touch(touch) for touch in touches)
-    except (ValueError, KeyError, TypeError, InputError) as error:
+    except OSError as error:
+        raise ResultsError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ResultsError(f"{path} is no history of touches: {error!r}") from error
 
 
@@ -51,7 +64,10 @@ def _touch(plain: dict[str, dict[str, object]]) -> Touch:
     felt = dict(plain["felt"])
     if "reason" in felt:
         return Touch(plain["q_target"], Missed(Miss[str(felt["reason"])], str(felt["where"])))  # type: ignore[arg-type]
-    contacts = [Contact(**contact) for contact in felt.pop("contacts")]  # type: ignore[attr-defined]
+    contacts = [
+        Contact(**{name: value for name, value in contact.items() if name not in FORMER})
+        for contact in felt.pop("contacts")  # type: ignore[attr-defined]
+    ]
     felt["other_links"] = tuple(felt["other_links"])  # type: ignore[arg-type]
     return Touch(plain["q_target"], Grasp(contacts=tuple(contacts), **felt))  # type: ignore[arg-type]
 

@@ -155,7 +155,6 @@ def is_protocol(kind):
 
 EVERY = [(it, name) for it in CALLS for name in parameters(it)]
 NUMBERS = [(it, n) for it, n in EVERY if kinds(parameters(it)[n]) <= {int, float, type(None)}]
-NUMBERS.remove((hg.Controller, "seed"))  # read nowhere
 PARTS = [(it, n) for it, n in EVERY if part_of(parameters(it)[n])]
 FLAGS = [(it, n) for it, n in EVERY if parameters(it)[n] is bool]
 

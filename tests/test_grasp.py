@@ -30,7 +30,7 @@ def test_a_plain_contact_is_a_material_point_felt_with_certainty():
     plain = Contact(position=[1, 2, 3], normal=[0, 1, 0])
     np.testing.assert_array_equal(plain.position, [1.0, 2.0, 3.0])
     assert plain.position.dtype == float
-    assert (plain.tip_radius, plain.confidence, plain.flexion) == (0.0, 1.0, ())
+    assert (plain.tip_radius, plain.flexion) == (0.0, ())
     assert plain.wrench is None and plain.point is None
     assert contact(flexion=[np.int64(2), 0]).flexion == (2, 0)
 
@@ -76,12 +76,6 @@ def test_a_tip_radius_is_finite_and_not_negative(radius):
 def test_noise_is_finite_and_not_negative(noise):
     with pytest.raises(InputError, match=r"Contact\.noise"):
         contact(noise=noise)
-
-
-@pytest.mark.parametrize("confidence", [-0.1, 1.1, np.nan, np.inf, None, "sure"])
-def test_confidence_lies_between_none_and_all(confidence):
-    with pytest.raises(InputError, match=r"Contact\.confidence"):
-        contact(confidence=confidence)
 
 
 @pytest.mark.parametrize("flexion", [("a",), (1.5,), 3, (None,)], ids=str)

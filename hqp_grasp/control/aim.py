@@ -103,8 +103,12 @@ class Aim:
             motion = np.where(end, straight, motion)
         return motion, after
 
-    def levels(self, stack: Stack, share: float) -> tuple[list[Level], list[Level]]:
+    def levels(
+        self, stack: Stack, share: float, asked: float = 1.0
+    ) -> tuple[list[Level], list[Level]]:
         """The laws' levels for a share of the way: down to force and moment, and those below.
+
+        The other laws ask for `asked` of their own steps, above force and moment as well as below.
 
         Force and moment have secant Jacobians, whose steps are exact for the predicted motion: with
         Δe_i what contact i adds to the error by its motion d_i, ∂e/∂x_i becomes
@@ -138,7 +142,8 @@ class Aim:
                     change = np.cross(after, x + moved) - np.cross(normals, x)
                     J = _blocks(task, grasp)
                 else:
-                    rows.append(task.rows(grasp))
+                    A, b = task.rows(grasp)
+                    rows.append((A, asked * b))
                     continue
                 J = J @ aside + change[:, :, None] * per_way[:, None, :]
                 J = J.transpose(1, 0, 2).reshape(3, -1) @ grasp.jacobian

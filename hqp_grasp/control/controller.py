@@ -90,7 +90,6 @@ class Controller:
     robot: Robot
     stack: Stack | Task
     form: str | Form = "hierarchy"
-    seed: int = 0
     budget: int | None = None  # touches in all, the first included
     landing: bool = True  # correct each step by the hand's kinematics, see `land`
 
@@ -149,7 +148,8 @@ class Controller:
             f"{self._shares[short]:g} of the step": short,
             "the same again": misses and misses[-1].reason in BROKEN,
         }
-        reason = ", ".join(what for what, done in reactions.items() if done)
+        told = [what for what, done in reactions.items() if done]
+        reason = ", ".join([*told, plan.reason] if plan.reason else told)
         return Step(self._clipped(grasp, x), stand.way, plan, self._shares[short], reason)
 
     def _search(self, q: np.ndarray, misses: Sequence[Missed]) -> Step:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -42,6 +42,8 @@ class Plan:
     gap: float | None  # [rad] ‖x − projection‖∞ where no limit is active, else None
     solve_us: float  # [µs]
     exact: bool = False  # x leads to a posture, joint by joint: it is not to be landed
+    planner: str = ""  # the rule that planned: "surface memory", "memoryless", …
+    reason: str = ""  # why it is another step than the laws ask for
 
 
 @runtime_checkable
@@ -94,7 +96,7 @@ class MemorylessForm:
         left: int | None = None,
         careful: bool = False,
     ) -> Plan:
-        return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
+        return _memoryless(self.hqp, stack, grasp)
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ class PaperHierarchyForm:
         left: int | None = None,
         careful: bool = False,
     ) -> Plan:
-        return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
+        return _paper_hierarchy(self.hqp, stack, grasp)
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ class ClippedForm:
     ) -> Plan:
         begin = time.perf_counter()
         solution = self.projection.solve(stack.law_levels(grasp))
-        return _clipped(solution, stack, grasp, begin)
+        return _clipped(solution, stack, grasp, begin, "clipped")
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ class PaperForm:
     ) -> Plan:
         begin = time.perf_counter()
         solution = self.projection.solve(paper_levels(stack, grasp))
-        return _clipped(solution, stack, grasp, begin)
+        return _clipped(solution, stack, grasp, begin, "paper")
 
 
 @dataclass(frozen=True)
@@ -189,8 +191,9 @@ class HierarchyForm:
     for the first touches only, and keeps the hand out of postures that balance but hold badly.
     After every two misses from one grasp another of these ways, and the MemorylessForm's, is taken.
 
-    Without a ForceTask and a MomentTask, and for other than two or three contacts, it is the
-    MemorylessForm.
+    Without a ForceTask and a MomentTask, and for other than two or three contacts, steps are the
+    MemorylessForm's; the hand settles all the same (`Course`). `Plan.planner` says which rule
+    planned a step.
     """
 
     hqp: HQP = field(default_factory=lambda: HQP(rank_tolerance=TOUCH_RANK))
@@ -211,10 +214,6 @@ class HierarchyForm:
         left: int | None = None,
         careful: bool = False,
     ) -> Plan:
-        force = [task for task in stack.tasks if isinstance(task, ForceTask)]
-        moment = [task for task in stack.tasks if isinstance(task, MomentTask)]
-        if not force or not moment or grasp.k not in (2, 3):
-            return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
         begin = time.perf_counter()
         history = history or (Touch(grasp.q, grasp),)
         last = [touch.felt for touch in history].index(grasp)
@@ -224,55 +223,70 @@ class HierarchyForm:
         back = course.way_back(left)
         if back is not None:
             return self._back(stack, grasp, back, begin)
-        careful = careful or (len(history) <= self.careful_for and _fingers_lean(stack, grasp))
-        ways = ["aim", "memoryless"]
-        if careful and not why_not(stack):
-            ways = ["paper", *ways]
-        misses = _misses_since_a_grasp(history) % len(self.shares)  # after so many it begins again
-        way = ways[misses // 2 % len(ways)]
+        way = self._way(stack, grasp, history, careful)
         if way == "paper":
-            return _hierarchy(self.hqp, stack, grasp, paper_levels(stack, grasp))
-        if way == "memoryless":
-            return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
-        memory = SurfaceMemory.of(history, force[0].radius)
-        misses = sum(isinstance(touch.felt, Missed) for touch in history[-RECENT:])
-        gain = min(1.0, force[0].gain, moment[0].gain)
-        aims = Aim.each(memory, grasp, course.unbalanced)
+            return _paper_hierarchy(self.hqp, stack, grasp)
+        aims = self._aims(stack, grasp, history, course) if way == "aim" else []
         if not aims:
-            return _hierarchy(self.hqp, stack, grasp, stack.law_levels(grasp))
-        aims = aims[min(misses // 2, len(aims) - 1) :][:TRIED]
+            return _memoryless(self.hqp, stack, grasp)
+        gain = min(1.0, *(t.gain for t in stack.tasks if isinstance(t, ForceTask | MomentTask)))
         missing = []
         for aim in aims:
             missing.append(self._missing(aim, gain, stack))
             if missing[-1] < REACHED:
                 break
         aim = aims[int(np.argmin(missing))]
-        step = self._towards(aim, gain, stack, course.ease)
-        solve_us = 1e6 * (time.perf_counter() - begin)
-        limit_active = step.shortened or step.solution.limit_active
-        gap = None if limit_active else float(np.abs(step.solution.x - step.unlimited).max())
-        return Plan(step.solution.x, step.solution, limit_active, gap, solve_us)
+        return self._towards(aim, gain, stack, course.ease, begin)
 
-    def _towards(self, aim: Aim, gain: float, stack: Stack, ease: float) -> _Step:
+    def _way(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch], careful: bool
+    ) -> Literal["paper", "aim", "memoryless"]:
+        there = [any(isinstance(v, law) for v in stack.tasks) for law in (ForceTask, MomentTask)]
+        if not all(there) or grasp.k not in (2, 3):
+            return "memoryless"
+        careful = careful or (len(history) <= self.careful_for and _fingers_lean(stack, grasp))
+        ways: list[Literal["paper", "aim", "memoryless"]] = ["aim", "memoryless"]
+        if careful and not why_not(stack):
+            ways.insert(0, "paper")
+        misses = _misses_since_a_grasp(history) % len(self.shares)  # after so many it begins again
+        return ways[misses // 2 % len(ways)]
+
+    def _aims(
+        self, stack: Stack, grasp: Grasp, history: Sequence[Touch], course: Course
+    ) -> list[Aim]:
+        """Where to go, the best first, after what misses passed over."""
+        radius = next(task.radius for task in stack.tasks if isinstance(task, ForceTask))
+        aims = Aim.each(SurfaceMemory.of(history, radius), grasp, course.unbalanced)
+        misses = sum(isinstance(touch.felt, Missed) for touch in history[-RECENT:])
+        return aims[min(misses // 2, max(len(aims) - 1, 0)) :][:TRIED]
+
+    def _towards(self, aim: Aim, gain: float, stack: Stack, ease: float, begin: float) -> Plan:
         grasp, share = aim.grasp, gain
         projection = Projection(rank_tolerance=self.hqp.rank_tolerance)
         for _ in range(SHORTENINGS):
-            aimed, rest = aim.levels(stack, share)
-            rest = [Level.equal(v.A, ease * share / gain * v.upper, v.name) for v in rest]
+            aimed, rest = aim.levels(stack, share, share / gain)
+            rest = [Level.equal(v.A, ease * v.upper, v.name) for v in rest]
             unlimited = projection.solve(aimed + rest).x
             ratio = cap_ratio(unlimited, stack, grasp)
             if ratio <= 1.0 + CAP_TOLERANCE:
                 break
             share /= ratio
-        solution = self.hqp.solve(stack.limit_levels(grasp) + aimed + rest)
-        return _Step(solution, unlimited, share < gain)
+        return _planned(
+            self.hqp, stack, grasp, aimed + rest, unlimited, share < gain, begin, "surface memory"
+        )
 
     def _missing(self, aim: Aim, gain: float, stack: Stack) -> float:
-        """Share of the whole way that limits other than caps keep the hand from."""
+        """Share of the whole way that limits other than caps keep the hand from.
+
+        Where the answer is not certified, no way is shown to lead there: all of it.
+        """
         uncapped = [v.level(aim.grasp) for v in stack.limits if v.priority is not Priority.CAP]
         motion = aim.predicted(gain)[0].ravel()
         way = Level.equal(aim.grasp.jacobian, motion, "whole way")
-        x = self.hqp.solve([*uncapped, way]).x
+        solution = self.hqp.solve([*uncapped, way])
+        if not solution.certified:
+            return 1.0
+        x = solution.x
         left, asked = np.linalg.norm(way.A @ x - motion), np.linalg.norm(motion)
         return float(left) / max(float(asked), NEAR)
 
@@ -286,20 +300,10 @@ class HierarchyForm:
         x = q - grasp.q
         share = 1.0 / max(1.0, cap_ratio(x, stack, grasp))
         level = Level.equal(np.eye(grasp.n), share * x, "back")
-        solution = self.hqp.solve([*stack.limit_levels(grasp), level])
-        limit_active = share < 1.0 or solution.limit_active
-        gap = None if limit_active else float(np.abs(solution.x - x).max())
-        solve_us = 1e6 * (time.perf_counter() - begin)
-        return Plan(solution.x, solution, limit_active, gap, solve_us, exact=True)
-
-
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """A step towards an aim."""
-
-    solution: Solution
-    unlimited: np.ndarray  # (n,) [rad] the projection of the same levels, without limits
-    shortened: bool
+        plan = _planned(
+            self.hqp, stack, grasp, [level], x, share < 1.0, begin, "return to the best grasp"
+        )
+        return replace(plan, exact=True)
 
 
 def _fingers_lean(stack: Stack, grasp: Grasp) -> bool:
@@ -330,23 +334,61 @@ def form_of(name: str, solver: str = "proxqp") -> Form:
     return ClippedForm() if name == "clipped" else PaperForm()
 
 
-def _hierarchy(hqp: HQP, stack: Stack, grasp: Grasp, levels: list[Level]) -> Plan:
+def _memoryless(hqp: HQP, stack: Stack, grasp: Grasp) -> Plan:
+    return _hierarchy(hqp, stack, grasp, stack.law_levels(grasp), "memoryless")
+
+
+def _paper_hierarchy(hqp: HQP, stack: Stack, grasp: Grasp) -> Plan:
+    return _hierarchy(hqp, stack, grasp, paper_levels(stack, grasp), "paper-hierarchy")
+
+
+def _hierarchy(hqp: HQP, stack: Stack, grasp: Grasp, levels: list[Level], planner: str) -> Plan:
     """The step of `levels` below the limits, all asking for the share of it that fits the caps."""
     begin = time.perf_counter()
     unlimited = Projection(rank_tolerance=hqp.rank_tolerance).solve(levels).x
     share = 1.0 / max(1.0, cap_ratio(unlimited, stack, grasp))
     asked = [Level.equal(level.A, share * level.upper, level.name) for level in levels]
-    solution = hqp.solve(stack.limit_levels(grasp) + asked)
+    return _planned(hqp, stack, grasp, asked, unlimited, share < 1.0, begin, planner)
+
+
+def _planned(
+    hqp: HQP,
+    stack: Stack,
+    grasp: Grasp,
+    asked: list[Level],
+    unlimited: np.ndarray,
+    shortened: bool,
+    begin: float,
+    planner: str,
+) -> Plan:
+    """The certified answer of the limits and as many of the levels asked for as have one.
+
+    In a strict hierarchy the answer of the first levels is theirs whatever is asked below: where
+    the whole is not certified, the last level is left out, and so on. Where not even limits are
+    certified, the hand stays.
+    """
+    levels = [*stack.limit_levels(grasp), *asked]
+    least = max(1, len(levels) - len(asked))
+    solution, left_out = hqp.solve(levels), []
+    while not solution.certified and len(levels) > least:
+        left_out.append(levels.pop().name)
+        solution = hqp.solve(levels)
+    limit_active = shortened or solution.limit_active
+    x, reason = solution.x, ""
+    if not solution.certified:
+        x, reason = np.zeros(grasp.n), "the hand stays: no answer is certified"
+    elif left_out:
+        reason = f"without {' and '.join(left_out[::-1])}: their answer is not certified"
+    gap = None if limit_active or reason else float(np.abs(x - unlimited).max())
     solve_us = 1e6 * (time.perf_counter() - begin)
-    limit_active = share < 1.0 or solution.limit_active
-    gap = None if limit_active else float(np.abs(solution.x - unlimited).max())
-    return Plan(solution.x, solution, limit_active, gap, solve_us)
+    return Plan(x, solution, limit_active, gap, solve_us, planner=planner, reason=reason)
 
 
-def _clipped(solution: Solution, stack: Stack, grasp: Grasp, begin: float) -> Plan:
+def _clipped(solution: Solution, stack: Stack, grasp: Grasp, begin: float, planner: str) -> Plan:
     solve_us = 1e6 * (time.perf_counter() - begin)
     x = clip_to_limits(solution.x, stack, grasp)
-    return Plan(x, solution, not np.array_equal(x, solution.x), None, solve_us)
+    limit_active = not np.array_equal(x, solution.x)
+    return Plan(x, solution, limit_active, None, solve_us, planner=planner)
 
 
 def clip_to_limits(x: np.ndarray, stack: Stack, grasp: Grasp) -> np.ndarray:

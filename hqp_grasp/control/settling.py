@@ -9,12 +9,14 @@ import numpy as np
 
 from hqp_grasp.control.limits import cap_ratio
 from hqp_grasp.grasp import Grasp, Touch
-from hqp_grasp.tasks import ForceTask, MomentTask, Stack
+from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Stack, Task
+
+Beside = tuple[Task, ...]  # laws at one priority
 
 FORCE_GOAL = 1e-3  # [N²] ε_f of a balanced grasp, at most
 MOMENT_GOAL = (2e-3) ** 2  # [(N·m)²] ε_m of one, at most
 BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
-BETTER = 2e-3  # by which the lower laws' errors fall, or the grasp is no better
+BETTER = 2e-3  # [rad] by which the other laws' errors fall, or the grasp is no better
 TELLING = 2.0  # standard errors that tell two values apart
 PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
@@ -25,9 +27,10 @@ SAME_ROUNDING = 1e-6  # [m] radii of one tip differ by, as long as it is a ball
 class Course:
     """How the touches of a history went, by the laws of a stack.
 
-    Under noise a grasp is balanced within BEYOND times its floor, and BETTER shows in as many
-    grasps as average the noise to it. A grasp that is not there any more, because the object has
-    moved, is forgotten.
+    A grasp is balanced by those of force and moment that the stack has, and by their goals; under
+    noise within BEYOND times its floor. It counts only where the laws above them are as near as
+    they ever were: none of these is given up for balance. BETTER shows in as many grasps as average
+    the noise to it. A grasp that is not there any more, because the object has moved, is forgotten.
     """
 
     stack: Stack
@@ -43,31 +46,41 @@ class Course:
         """Of a history with one grasp at least."""
         hits = [t.felt for t in history if isinstance(t.felt, Grasp)]
         felt = [isinstance(touch.felt, Grasp) for touch in history]
+        balance = [any(isinstance(t, law) for t in stack.tasks) for law in (ForceTask, MomentTask)]
         scores, doubtful = np.full((2, len(history)), np.inf)
-        errors, floor = _errors(hits)
-        goals = np.array([FORCE_GOAL, MOMENT_GOAL])
-        scores[felt] = (errors / np.maximum(goals, BEYOND * floor)).max(axis=1)
-        doubtful[felt] = ((errors + floor) / goals).max(axis=1)
+        errors, floor = (v[:, balance] for v in _errors(hits))
+        goals = np.array([FORCE_GOAL, MOMENT_GOAL])[balance]
+        scores[felt] = (errors / np.maximum(goals, BEYOND * floor)).max(axis=1, initial=0.0)
+        doubtful[felt] = ((errors + floor) / goals).max(axis=1, initial=0.0)
+        above, below = _above_and_below(stack)
+        away = np.full((len(history), len(above)), np.inf)
+        away[felt] = [_errors_of(above, grasp, hits) for grasp in hits]
+        served = np.array(felt)
+        for error in away.T:
+            served &= error <= error[served].min() + BETTER
+        met = [bool((errors <= BETTER).all()) for errors in away]
         noise = sum(contact.noise**2 for contact in hits[-1].contacts)  # [rad²] of the angles' sum
         patience = PATIENCE + noise / BETTER**2
         tells = max(BETTER, TELLING * np.sqrt(2.0 * noise))
-        best, least, stale, lost, worse = -1, np.inf, 0, False, 0
+        best, stale, lost, worse = -1, 0, False, 0
+        least: tuple[float, ...] = ()
         for i, touch in enumerate(history):
             if scores[i] <= 1.0:
-                if lost or stale >= patience:
+                if lost or stale >= patience or not served[i]:
                     continue
-                value = _below(stack, touch.felt)  # type: ignore[arg-type]
+                value = (*away[i], *_errors_of(below, touch.felt, hits))  # type: ignore[arg-type]
                 stale += 1
-                worse += value > least + tells
-                if best < 0 or value < least - BETTER:
+                worse += _differ(value, least, tells) > 0
+                if best < 0 or _differ(value, least, BETTER) < 0:
                     best, least, stale = i, value, 0
-            elif best >= 0:
-                lost = True
+            elif best >= 0 and any(balance):
+                lost = lost or met[best] or stale >= patience
+                stale += not lost
                 if isinstance(touch.felt, Grasp) and _near(touch.q_target, history[best]):
                     best, stale, lost = -1, 0, False
-        return cls(
-            stack, history, scores, int(doubtful.argmin()), best, worse, lost or stale >= patience
-        )
+        nearest = int(np.where(served, doubtful, np.inf).argmin())
+        over = lost or stale >= patience
+        return cls(stack, history, scores, nearest, best, worse, over)
 
     @property
     def unbalanced(self) -> list[Grasp]:
@@ -119,10 +132,54 @@ def _errors(hits: Sequence[Grasp]) -> tuple[np.ndarray, np.ndarray]:
     return errors, np.array([grasp.floor for grasp in hits])
 
 
-def _below(stack: Stack, grasp: Grasp) -> float:
-    """Sum of the other laws' absolute errors."""
-    others = (t for t in stack.tasks if not isinstance(t, ForceTask | MomentTask))
-    return sum(float(np.abs(task.error(grasp)).sum()) for task in others)
+def _above_and_below(stack: Stack) -> tuple[list[Beside], list[Beside]]:
+    """The laws other than force and moment, by priority: those above the last of these, and below.
+
+    A law beside force or moment is as important as they are: it counts as above.
+    """
+    balance = [any(isinstance(t, ForceTask | MomentTask) for t in p) for p in stack.priorities]
+    last = max((i for i, there in enumerate(balance) if there), default=-1)
+    others = [
+        tuple(t for t in tasks if not isinstance(t, ForceTask | MomentTask))
+        for tasks in stack.priorities
+    ]
+    parts = others[: last + 1], others[last + 1 :]
+    return tuple([beside for beside in part if beside] for part in parts)  # type: ignore[return-value]
+
+
+def _errors_of(priorities: Sequence[Beside], grasp: Grasp, hits: Sequence[Grasp]) -> list[float]:
+    """Sum of absolute errors of each priority's laws [rad].
+
+    A law of another unit counts by how far a joint has to turn for it: by the norm of its Jacobian
+    at the first grasp where it is not zero. Laws beside one another count by their weights.
+    """
+    sums = []
+    for tasks in priorities:
+        heaviest = max(task.weight for task in tasks)
+        sums.append(
+            sum(
+                float(np.abs(task.error(grasp)).sum())
+                * (task.weight / heaviest / _per_radian(task, hits))
+                for task in tasks
+            )
+        )
+    return sums
+
+
+def _per_radian(task: Task, hits: Sequence[Grasp]) -> float:
+    """How much of a law's error a radian makes [unit of the error / rad]: 1 of an angle's."""
+    if isinstance(task, KinematicTask) and task.kind == "angle":
+        return 1.0
+    norms = (float(np.linalg.norm(task.jacobian(grasp), 2)) for grasp in hits)
+    return next((norm for norm in norms if norm > 0.0), 1.0)
+
+
+def _differ(value: Sequence[float], other: Sequence[float], tells: float) -> int:
+    """−1 where the first entry that differs by more than `tells` is less, 1 where more, else 0."""
+    for one, two in zip(value, other, strict=False):
+        if abs(one - two) > tells:
+            return -1 if one < two else 1
+    return 0
 
 
 def _near(q: np.ndarray, touch: Touch) -> bool:

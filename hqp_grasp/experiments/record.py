@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL
-from hqp_grasp.errors import one_of
+from hqp_grasp.errors import SingularTaskError, one_of
 from hqp_grasp.grasp import Grasp, Missed
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
-from hqp_grasp.tasks.stack import Stack
+from hqp_grasp.tasks.stack import Stack, Task
 from hqp_grasp.touch.simulated import SimulatedHand
 from hqp_grasp.world.robot import Robot
 
@@ -36,6 +36,7 @@ COLUMNS = {
     "in_transit": "links beside the fingertips that meet the object on the way, fingers open",
     "step_share": "share of the planned step that was taken",
     "reaction": "what the controller did about the misses since the last grasp",
+    "planner": "the rule that planned the step",
     "limit_active": "bool: a limit holds the step that led here",
     "limit_violation": "rad: how far the worst joint is outside its range, commanded or reached",
     "hqp_projection_gap": "rad: largest difference of hierarchy and projection, limits inactive",
@@ -73,7 +74,7 @@ CONTACT_COLUMNS = {
 JOINT_COLUMN = "rad: joint angle"
 # "good", and what keeps a trial from being so, the gravest first.
 VERDICTS = ("good", "error", "lost", "not balanced", "link inside", "violation")
-TEXTS = {"outcome", "other_links", "in_transit", "method", "error", "reaction"}
+TEXTS = {"outcome", "other_links", "in_transit", "method", "error", "reaction", "planner"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -227,10 +228,10 @@ def felt_row(
     row = empty_row(robot, stack) | {
         "eps_f": ForceTask().potential(grasp),
         "eps_m": MomentTask().potential(grasp),
-        "eps_k": float(KinematicTask(error="angle").error(grasp).mean()),
-        "eps_k_eq7": float(KinematicTask(error="eq7").error(grasp).sum()),
+        "eps_k": _kinematic(grasp, "angle", np.mean),
+        "eps_k_eq7": _kinematic(grasp, "eq7", np.sum),
         "adduction_deg": angle,
-        "elevation_deg": float(np.degrees(np.arcsin(-robot.palm(grasp.q)[1][2, 2]))),
+        "elevation_deg": _elevation(robot.palm(grasp.q)[1]),
         "in_contact": True,
         "outcome": "touch",
         "other_links": ", ".join(grasp.other_links),
@@ -248,6 +249,23 @@ def felt_row(
                 for column, number in zip(CONTACT_COLUMNS, numbers, strict=True)
             }
     return row | {f"q_{joint}": float(q) for joint, q in zip(robot.joints, grasp.q, strict=True)}
+
+
+def _elevation(R_palm: np.ndarray) -> float:
+    """Angle of the palm's approach axis below the horizontal [deg]."""
+    return float(np.degrees(np.arcsin(np.clip(-R_palm[2, 2], -1.0, 1.0))))
+
+
+def _kinematic(
+    grasp: Grasp, error: str, of: Callable[[np.ndarray], np.floating[Any]]
+) -> float | None:
+    """Mean or sum of the law's errors, None where flexions do not tell: the stack may lack it."""
+    if not all(contact.flexion for contact in grasp.contacts):
+        return None
+    try:
+        return float(of(KinematicTask(error=error).error(grasp)))
+    except SingularTaskError:
+        return None
 
 
 def true_columns(
@@ -281,19 +299,28 @@ def law_columns(stack: Stack, grasp: Grasp | None, solution: Solution | None) ->
     """LAW_COLUMNS of each law: its error at `grasp`, its level in the step that led there.
 
     Laws at one priority share a level, and so its status and rank. Where a form of stepping has
-    no level for a law ("paper" composes force and moment into one step), both are None.
+    no level for a law ("paper" composes force and moment into one step), both are None; and so is
+    the error where the law is undefined at this grasp.
     """
     levels = {level.name: level for level in solution.levels} if solution is not None else {}
-    errors = stack.errors(grasp) if grasp is not None else {}
     row: dict[str, object] = {}
     for tasks in stack.priorities:
         level = levels.get(" + ".join(task.name for task in tasks))
         for task in tasks:
-            error = errors.get(task.name)
-            row[f"error_{task.name}"] = None if error is None else float(np.linalg.norm(error))
+            row[f"error_{task.name}"] = _norm(task, grasp)
             row[f"status_{task.name}"] = None if level is None else level.status
             row[f"rank_{task.name}"] = None if level is None else level.rank
     return row
+
+
+def _norm(task: Task, grasp: Grasp | None) -> float | None:
+    """‖e‖ of a law, None without a grasp, and where the law is undefined there."""
+    if grasp is None:
+        return None
+    try:
+        return float(np.linalg.norm(Stack.of(task).errors(grasp)[task.name]))
+    except SingularTaskError:
+        return None
 
 
 def verdicts(table: pa.Table) -> dict[int, str]:

@@ -80,7 +80,7 @@ class Trial:
         if not isinstance(self.start, Start | Grasp):
             raise InputError(f"Trial.start must be a Start or a Grasp; got {self.start!r}")
         object.__setattr__(self, "stack", Stack.of(self.stack))
-        self.controller(self.scene, 0)  # raises for what it cannot compose
+        self.controller(self.scene)  # raises for what it cannot compose
 
     @property
     def physics(self) -> Physics | None:
@@ -89,11 +89,9 @@ class Trial:
             return self.probe
         return Physics() if self.probe == "physical" else None
 
-    def controller(self, scene: Scene, seed: int) -> Controller:
+    def controller(self, scene: Scene) -> Controller:
         """The controller of one trial, in the scene where it began."""
-        return Controller(
-            scene.articulated, self.stack, self.form, seed, self.probes + 1, self.landing
-        )
+        return Controller(scene.articulated, self.stack, self.form, self.probes + 1, self.landing)
 
     def run(self, seed: int | Sequence[int], probe: Probe | None = None) -> Record:
         """Begin, then step and touch `probes` times, or until the controller gives up.
@@ -185,7 +183,7 @@ class Trial:
     ) -> Iterator[tuple[dict[str, object], Touch | None]]:
         """The row of every touch as it is made; the last, without a touch, tells of giving up."""
         robot = began.scene.articulated
-        controller = self.controller(began.scene, entropy[-1])
+        controller = self.controller(began.scene)
         stack = Stack.of(self.stack)
         hand, touching = self._hand(began, entropy, probe)
         felt: Grasp | Missed = began.grasp
@@ -275,6 +273,7 @@ def _about(step: Step) -> dict[str, object]:
     return {
         "step_share": step.share,
         "reaction": step.reason or None,
+        "planner": plan.planner or None,
         "limit_active": plan.limit_active,
         "hqp_projection_gap": plan.gap,
         "solve_us": plan.solve_us,

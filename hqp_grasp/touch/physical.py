@@ -328,7 +328,7 @@ class PhysicalProbe:
             noise = (
                 float(np.sqrt(unsure[i, :3].mean() + unsure[i, 3:].mean() / radius**2)) / pressed
             )
-            contacts.append(Contact(place, n, wrench=world, confidence=upright, noise=noise))
+            contacts.append(Contact(place, n, wrench=world, noise=noise))
         return robot.grasp(q, contacts)
 
     def _steady(self, readings: Readings) -> np.ndarray:

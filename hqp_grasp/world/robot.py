@@ -438,8 +438,8 @@ class Robot:
         """A complete grasp from joint angles and what was felt there.
 
         `contacts` has one Contact for each contact point, in the description's order: position and
-        outward normal (world), perhaps wrench, confidence and noise; on a link that is no ball,
-        perhaps the `tip_radius` it is rounded by there. Name, link, point and flexion are the
+        outward normal (world), perhaps wrench and noise; on a link that is no ball,
+        perhaps the `tip_radius` it is rounded by there. Name, point and flexion are the
         robot's, and so are the grasp's Jacobian, Hessian and coupling; and the position too on a
         ball felt with noise, for joint angles tell its centre.
         """
@@ -463,7 +463,6 @@ class Robot:
                 replace(
                     contact,
                     name=point.name,
-                    body=self.model.body(int(self._bodies[i])).name,
                     point=places[i],
                     flexion=self.flexion[i],
                     tip_radius=radius,

@@ -3,16 +3,18 @@
 import copy
 import dataclasses
 import itertools
+import json
 
 import numpy as np
 import pytest
 
 from hqp_grasp.control.controller import SHARES, Controller
-from hqp_grasp.control.forms import FORMS, form_of
+from hqp_grasp.control.forms import FORMS, MemorylessForm, form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
+from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.history import load_history, save_history
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, stack_of
 from hqp_grasp.touch.geometric import GeometricProbe
@@ -84,9 +86,7 @@ def test_a_stored_history_is_continued_bit_for_bit(scene, robot, stack, first, t
 
 
 def test_a_stored_history_keeps_every_field_of_grasps_and_misses(first, tmp_path):
-    sensed = dataclasses.replace(
-        first.contacts[0], wrench=[0.1, 0.2, 1 / 3, 0.0, -0.0, 1e-300], confidence=0.7
-    )
+    sensed = dataclasses.replace(first.contacts[0], wrench=[0.1, 0.2, 1 / 3, 0.0, -0.0, 1e-300])
     grasp = dataclasses.replace(first, contacts=(sensed, *first.contacts[1:]), other_links=("l",))
     history = [Touch(first.q, grasp), Touch(first.q + 0.1, Missed(Miss.INSIDE, "finger_1"))]
     save_history(tmp_path / "h.json", history)
@@ -98,6 +98,39 @@ def test_a_stored_history_keeps_every_field_of_grasps_and_misses(first, tmp_path
     for one, other in zip(back[0].felt.contacts, grasp.contacts, strict=True):
         for field in dataclasses.fields(Contact):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_a_history_stored_with_fields_that_contacts_no_longer_have_is_read(first, tmp_path):
+    path = tmp_path / "h.json"
+    save_history(path, [Touch(first.q, first)])
+    older = json.loads(path.read_text())
+    for contact in older[0]["felt"]["contacts"]:
+        contact |= {"body": "f1_tip", "confidence": 0.9}
+    path.write_text(json.dumps(older))
+    (touch,) = load_history(path)
+    np.testing.assert_array_equal(touch.felt.positions, first.positions)
+    older[0]["felt"]["contacts"][0]["colour"] = "red"
+    path.write_text(json.dumps(older))
+    with pytest.raises(ResultsError, match=r"no history of touches.*colour"):
+        load_history(path)
+
+
+def test_a_history_that_is_not_there_or_cannot_be_written_is_named(first, tmp_path):
+    with pytest.raises(ResultsError, match=r"nowhere\.json cannot be read: No such file"):
+        load_history(tmp_path / "nowhere.json")
+    with pytest.raises(ResultsError, match=r"h\.json cannot be written: No such file"):
+        save_history(tmp_path / "no_folder" / "h.json", [Touch(first.q, first)])
+
+
+def test_what_a_plan_says_of_itself_is_told_with_the_step(robot, stack, first):
+    @dataclasses.dataclass(frozen=True)
+    class Unsure(HQP):
+        def solve(self, levels, warm=None):
+            return dataclasses.replace(super().solve(levels, warm), certified=False)
+
+    step = Controller(robot, stack, MemorylessForm(Unsure())).step([Touch(first.q, first)])
+    np.testing.assert_allclose(step.q_target, first.q, atol=1e-12)
+    assert step.reason == "the hand stays: no answer is certified"
 
 
 def test_targets_are_within_the_ranges_and_steps_within_the_caps(scene, robot, stack, first):
@@ -283,13 +316,12 @@ def test_a_touch_holds_finite_joints_and_what_was_felt(first):
 
 
 def test_a_robots_grasp_is_the_one_that_its_probe_feels(robot, first):
-    felt = [Contact(c.position, c.normal, confidence=0.5) for c in first.contacts]
+    felt = [Contact(c.position, c.normal) for c in first.contacts]
     again = robot.grasp(first.q, felt)
     for name in ("q", "jacobian", "hessian", "coupling", "offset", "positions", "normals"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     for one, other in zip(again.contacts, first.contacts, strict=True):
-        assert (one.name, one.body, one.flexion) == (other.name, other.body, other.flexion)
-        assert one.confidence == 0.5
+        assert (one.name, one.flexion) == (other.name, other.flexion)
     with pytest.raises(InputError, match=r"touches with 3 points .*got 2 contacts"):
         robot.grasp(first.q, felt[:2])
 
@@ -309,9 +341,10 @@ def test_a_form_of_ones_own_stands_in_the_place_of_a_name(robot, first):
 
 def test_the_history_of_something_else_is_named(tmp_path):
     path = tmp_path / "other.json"
-    path.write_text('{"a": 1}')
-    with pytest.raises(ResultsError, match="no history of touches"):
-        load_history(path)
+    for text in ('{"a": 1}', "[1]", '[{"felt": {"contacts": [[1]]}, "q_target": [0]}]', "", "\xff"):
+        path.write_text(text, encoding="latin-1")
+        with pytest.raises(ResultsError, match="no history of touches"):
+            load_history(path)
 
 
 def test_a_hand_that_is_lost_begins_again_from_its_first_grasp(scene, robot, stack, first):

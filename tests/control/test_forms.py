@@ -5,15 +5,26 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hqp_grasp.control.forms import MemorylessForm, cap_ratio, clip_to_limits, form_of
+from hqp_grasp.control.aim import Aim
+from hqp_grasp.control.forms import (
+    FORMS,
+    HierarchyForm,
+    MemorylessForm,
+    PaperHierarchyForm,
+    cap_ratio,
+    clip_to_limits,
+    form_of,
+)
 from hqp_grasp.control.limits import StepLimit
-from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.control.memory import SurfaceMemory
+from hqp_grasp.grasp import Contact, Grasp, Touch
 from hqp_grasp.hierarchy.hqp import HQP
-from hqp_grasp.tasks import stack_of
+from hqp_grasp.tasks import ForceTask, stack_of
 
 SEEDS = range(5)
 EXACT = 1e-12
 WIDE = StepLimit(1e3, 1e3)
+AROUND = np.array([[1.0, 0.1, 0.0], [-0.4, 0.9, 0.0], [-0.5, -0.8, 0.0]])
 
 
 def hand(seed, normals, n=11):
@@ -87,3 +98,83 @@ def test_what_stands_below_the_kinematic_law_is_never_felt(above, seed):
     )
     form = MemorylessForm()
     np.testing.assert_allclose(form.plan(more, grasp).x, form.plan(alone, grasp).x, atol=EXACT)
+
+
+# ---------------------------------------------------------------- answers that are not certified
+
+
+@dataclasses.dataclass(frozen=True)
+class Unsure(HQP):
+    """A solver that certifies hierarchies of so many levels, and returns rubbish beyond."""
+
+    levels: int = 0
+
+    def solve(self, levels, warm=None):
+        solution = super().solve(levels, warm)
+        if len(levels) <= self.levels:
+            return solution
+        return dataclasses.replace(solution, x=solution.x + 0.3, certified=False)
+
+
+FORMS_THAT_SOLVE = [MemorylessForm, PaperHierarchyForm, HierarchyForm]
+
+
+@pytest.mark.parametrize("form", FORMS_THAT_SOLVE)
+def test_where_no_answer_is_certified_the_hand_stays(form):
+    stack, grasp = stack_of("fmk").within(WIDE), hand(0, AROUND)
+    plan = form(Unsure(rank_tolerance=1e-6)).plan(stack, grasp)
+    np.testing.assert_array_equal(plan.x, np.zeros(grasp.n))
+    assert plan.reason == "the hand stays: no answer is certified" and plan.gap is None
+
+
+def test_the_last_laws_are_left_out_until_the_answer_of_the_first_is_certified():
+    grasp, limits = hand(0, AROUND), StepLimit(0.35, 0.03)
+    whole = form_of("memoryless").plan(stack_of("fmk").within(limits), grasp)
+    certified = MemorylessForm(Unsure(rank_tolerance=1e-6, levels=3))  # caps, contact, force
+    plan = certified.plan(stack_of("fmk").within(limits), grasp)
+    assert plan.solution.certified and plan.gap is None
+    assert plan.reason == "without moment and kinematic: their answer is not certified"
+    force = ForceTask().jacobian(grasp)
+    np.testing.assert_allclose(force @ plan.x, force @ whole.x, atol=1e-9)
+    assert cap_ratio(plan.x, stack_of("f").within(limits), grasp) <= 1.0 + 1e-9
+
+
+def test_a_way_back_that_is_not_certified_is_not_taken():
+    stack, good = stack_of("fmk").within(WIDE), hand(0, AROUND)
+    there = Touch(good.q + 0.1, dataclasses.replace(good, q=good.q + 0.1))
+    history = [Touch(good.q, good), there]
+    plan = HierarchyForm().plan(stack, there.felt, history, left=1)
+    assert plan.planner == "return to the best grasp" and np.abs(plan.x).max() > 0.05
+    stays = HierarchyForm(Unsure(rank_tolerance=1e-6)).plan(stack, there.felt, history, left=1)
+    np.testing.assert_array_equal(stays.x, np.zeros(good.n))
+    assert "no answer is certified" in stays.reason
+
+
+def test_an_aim_whose_reach_is_not_certified_counts_as_out_of_reach():
+    stack, grasp = stack_of("fm").within(WIDE), hand(0, AROUND)
+    aim = Aim.each(SurfaceMemory.of([Touch(grasp.q, grasp)]), grasp)[0]
+    assert HierarchyForm()._missing(aim, 1.0, stack) < 1.0
+    assert HierarchyForm(Unsure(rank_tolerance=1e-6))._missing(aim, 1.0, stack) == 1.0
+
+
+# ---------------------------------------------------------------- which rule planned
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_plan_says_which_rule_planned_it(name):
+    grasp = hand(0, AROUND)
+    planner = form_of(name).plan(stack_of("fm").within(WIDE), grasp).planner
+    assert planner == ("surface memory" if name == "hierarchy" else name)
+
+
+@pytest.mark.parametrize(
+    ("laws", "k"), [("f", 3), ("m", 3), ("k", 3), ("mk", 3), ("fmk", 1), ("fmk", 4), ("fm", 6)]
+)
+def test_the_default_form_says_where_it_is_the_memoryless_one(laws, k):
+    stack, grasp = (
+        stack_of(laws).within(WIDE),
+        hand(1, np.random.default_rng(0).normal(size=(k, 3))),
+    )
+    plan, plain = (form_of(name).plan(stack, grasp) for name in ("hierarchy", "memoryless"))
+    assert plan.planner == plain.planner == "memoryless"
+    np.testing.assert_array_equal(plan.x, plain.x)

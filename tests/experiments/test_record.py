@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from typing import ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -9,7 +10,7 @@ import pytest
 from own_law import HeightTask
 
 from hqp_grasp.control.controller import Controller
-from hqp_grasp.errors import InputError, ReachError, SolverError
+from hqp_grasp.errors import InputError, ReachError, SingularTaskError, SolverError
 from hqp_grasp.experiments import start
 from hqp_grasp.experiments.record import (
     COLUMNS,
@@ -77,7 +78,7 @@ def test_every_law_has_its_error_by_its_name_in_every_row(record, stack):
 
 
 def test_status_and_rank_of_a_law_are_those_of_its_level_in_the_step_that_led_there(trial, record):
-    controller, probe = trial.controller(trial.scene, 0), GeometricProbe(trial.scene)
+    controller, probe = trial.controller(trial.scene), GeometricProbe(trial.scene)
     history = [Touch(record.grasps[0].q, record.grasps[0])]
     assert all(record.rows[0][f"{c}_{n}"] is None for c in ("status", "rank") for n in ("force",))
     for row in record.rows[1:]:
@@ -113,7 +114,8 @@ def test_a_probe_that_missed_says_how_the_laws_fared_in_its_step(scene, record):
             return Missed(Miss.NO_TOUCH, "finger_1")
 
     start = record.grasps[0]
-    missed = Trial(scene, ForceTask(), probes=1, start=start).run(0, Nothing()).rows[1]
+    plain = Trial(scene, ForceTask(), probes=1, form="memoryless", start=start)
+    missed = plain.run(0, Nothing()).rows[1]
     assert missed["status_force"] in ("met", "nearest") and missed["rank_force"] in (1, 2, 3)
     assert missed["error_force"] is None and missed["contact_1_x"] is None
 
@@ -122,6 +124,64 @@ def test_what_is_missing_in_a_column_is_nan_or_none(record):
     status, rank = record.column("status_force"), record.column("rank_force")
     assert status[0] is None and isinstance(status[1], str)
     assert np.isnan(rank[0]) and rank[1] in (1.0, 2.0, 3.0)
+
+
+def test_a_law_that_the_stack_lacks_is_null_where_it_is_undefined(scene, record):
+    """It ended trials: five flexions that move a contact equally fast two ways, or not at all."""
+    grasp = record.grasps[0]
+    still = grasp.jacobian.copy()
+    still[:, grasp.contacts[1].flexion] = 0.0
+    without = [dataclasses.replace(c, flexion=()) for c in grasp.contacts]
+    for odd in (
+        dataclasses.replace(grasp, jacobian=still),
+        dataclasses.replace(grasp, contacts=tuple(without)),
+    ):
+        begun = Trial(scene, ForceTask() >> MomentTask(), probes=2, start=odd).run(0)
+        assert begun.rows[0]["eps_k"] is None and np.isnan(begun.column("eps_k")[0])
+        assert begun.rows[0]["eps_f"] > 0.0 and begun.rows[1]["eps_k"] > 0.0
+        check = begun.to_table()
+        assert check["eps_k"].null_count == 1
+    # Eq. 7 is defined where flexions stand still: nothing presses.
+    assert Trial(scene, ForceTask(), probes=1, start=grasp).run(0).rows[0]["eps_k_eq7"] > 0.0
+
+
+class Whimsical(HeightTask):
+    """A law that is undefined from the second grasp on, or at the first."""
+
+    raises: ClassVar[Exception] = SingularTaskError("undefined up there")
+    at: ClassVar[float] = 0.0
+
+    def error(self, grasp):
+        if grasp.q[0] != self.at:
+            raise self.raises
+        return super().error(grasp)
+
+
+def test_a_law_of_the_stack_is_null_in_the_row_where_it_is_undefined(scene, record, monkeypatch):
+    """The row is kept with all the rest of it; the step from there says what is wrong."""
+    start = record.grasps[0]
+    monkeypatch.setattr(Whimsical, "at", start.q[0])
+    stack = ForceTask() >> MomentTask() >> Whimsical()
+    trial = Trial(scene, stack, probes=1, form="memoryless", start=start)
+    last = trial.run(0)
+    assert last.error is None
+    for row, there in zip(last.rows, (True, False), strict=True):
+        assert (row["error_whimsical"] is not None) is there
+        assert row["error_force"] > 0.0 and row["in_contact"] and row["contact_1_x"]
+    told = dataclasses.replace(trial, probes=2).attempt(0)
+    assert told.error.startswith("SingularTaskError: undefined up there; raised by the law")
+    assert [row["in_contact"] for row in told.rows] == [True, True, False]
+    # A law that is broken is no such thing.
+    monkeypatch.setattr(Whimsical, "raises", ZeroDivisionError("a bug"))
+    told = trial.attempt(0)
+    assert told.error.startswith("ZeroDivisionError: a bug")
+
+
+def test_the_rule_that_planned_a_step_stands_in_its_row(record, scene):
+    assert [row["planner"] for row in record.rows] == [None] + ["memoryless"] * PROBES
+    assert record.to_table()["planner"].type == pa.string()
+    rows = Trial(scene, ForceTask() >> MomentTask(), probes=12).run(0).rows
+    assert {row["planner"] for row in rows[1:]} >= {"surface memory", "return to the best grasp"}
 
 
 # ---------------------------------------------------------------- contacts and joints

@@ -18,6 +18,7 @@ from hqp_grasp.experiments import start
 from hqp_grasp.experiments.plots import FLOOR, convergence, convergence_figure
 from hqp_grasp.experiments.scenario import Settings, replay_command, summary, trial_of
 from hqp_grasp.experiments.study import Study
+from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.world.scene import Prism, Scene
 
 CYLINDER = Path(__file__).parents[2] / "scenarios" / "cylinder.py"
@@ -395,13 +396,18 @@ def test_a_folder_of_other_settings_is_said_in_one_line(ran):
 @pytest.fixture
 def failing(monkeypatch):
     """Trial 1 ends in a SolverError at its first step."""
-    step = Controller.step
+    begin, step, trial = Trial._begin, Controller.step, [0]
+
+    def beginning(self, entropy, probe):
+        trial[0] = entropy[-1]
+        return begin(self, entropy, probe)
 
     def raising(self, history):
-        if self.seed == 1:
+        if trial[0] == 1:
             raise SolverError("no method found an answer")
         return step(self, history)
 
+    monkeypatch.setattr(Trial, "_begin", beginning)
     monkeypatch.setattr(Controller, "step", raising)
 
 

@@ -345,7 +345,7 @@ def test_a_trial_that_is_lost_keeps_what_it_felt_before(trial, scene):
 
 
 class SensedHand:
-    """What a driver of a real hand would tell: wrenches, confidence, noisy normals, no Hessian."""
+    """What a driver of a real hand would tell: wrenches, noisy normals, no Hessian."""
 
     def __init__(self, scene):
         self.robot, self.inner = scene.articulated, GeometricProbe(scene)
@@ -365,7 +365,6 @@ class SensedHand:
                     normal,
                     flexion=contact.flexion,
                     wrench=[*-normal, 0.0, 0.0, 0.0],
-                    confidence=0.9,
                 )
             )
         return Grasp(
