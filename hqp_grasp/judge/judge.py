@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
+from hqp_grasp.control.forces import Grip, equal_normal, equal_torque, normal_null_space
 from hqp_grasp.control.reach import lifted
 from hqp_grasp.errors import InputError, one_of, positive
 from hqp_grasp.grasp import Grasp
@@ -22,13 +23,20 @@ CYCLE = 0.05  # [s] between looks at what is felt
 SETTLING = 0.3  # [s] of squeezing after the torques have stopped growing
 LIFTING = 0.08  # [m/s] of the palm
 HOLDING = 1.0  # [s] held, once lifted
-RISEN = 0.9  # share of the palm's way that a lifted object has risen by, at least
+RISEN = 0.5  # share of the palm's way that a lifted object has risen by: it may slip, not stay
 WATCHED = 0.5  # [s] of a pull between looks whether the object has slipped
 GRAVITY = 10.0  # [m/s²] of DexGraspBench's pulls
 DURATION = 2.0  # [s] of each of them
 THROWN, TUMBLED = 0.05, np.radians(15.0)  # [m], [rad] beyond which they have failed
 
-Law = Callable[[Robot, Grasp], np.ndarray]  # joint torques (n,) [N·m] for a grasp as it is felt
+# Joint torques (n,) [N·m] for a grasp as it is felt; None: those of before.
+Law = Callable[[Robot, Grasp], np.ndarray | None]
+SIMPLE = {
+    "equal-torque": equal_torque,
+    "equal-normal": equal_normal,
+    "null-space": normal_null_space,
+}
+SQUEEZES = ("hierarchy", *SIMPLE)
 
 
 @dataclass(frozen=True)
@@ -58,9 +66,12 @@ class Judged:
 class Judge:
     """Frees the object, squeezes it, lifts it by the arm, and pulls at it until it slips.
 
-    `squeeze` gives the joint torques for a grasp as it is felt; it is asked again every CYCLE until
-    the object is lifted, and then no more: the grip does not react to the pulls. In between the
-    servos stay where they were told, so fingers yield like springs.
+    `squeeze` is how the fingers press: "hierarchy" is `Grip` by its laws; "equal-torque",
+    "equal-normal" and "null-space" (of the grasp map, along the normals) are simpler. All press
+    with k times `force`, and the hierarchy with more where the load asks for it. Or it is a
+    function of the robot and the grasp as it is felt. It is asked again every CYCLE until the
+    object is lifted, and then no more: the grip does not react to the pulls. In between the servos
+    stay where they were told, so fingers yield like springs.
 
     protocol="pulls": the object stands on a pedestal, is lifted by `lift`, and pulled at with
     forces and torques along the world's axes, one after the other from the same state, growing
@@ -75,9 +86,11 @@ class Judge:
     """
 
     scene: Scene
-    squeeze: Law
+    squeeze: str | Law = "hierarchy"
+    force: float = 5.0  # [N] mean normal force of a contact
     mass: float = 0.1  # [kg]
     friction: float = 0.6
+    believed: float = 0.5  # friction that the hierarchy counts on
     protocol: str = "pulls"
     lift: float = 0.1  # [m]
     slip: float = 0.01  # [m]
@@ -98,7 +111,7 @@ class Judge:
         if not isinstance(self.scene, Scene):
             raise InputError(f"Judge.scene must be a Scene; got {self.scene!r}")
         if not callable(self.squeeze):
-            raise InputError(f"Judge.squeeze must give torques for a grasp; got {self.squeeze!r}")
+            one_of("squeeze", self.squeeze, SQUEEZES)
 
     def judge(self, grasp: Grasp) -> Judged:
         """Test one grasp, from the posture in which it was felt."""
@@ -109,7 +122,7 @@ class Judge:
             support="pedestal", mass=self.mass, friction=self.friction, timestep=self.timestep
         )
         bench = Bench(self.scene, grasp, physics)
-        hand = _Squeeze(bench, self.squeeze, grasp)
+        hand = _Squeeze(bench, self._law(robot), grasp)
         hand.tighten()
         if self.protocol == "dexgraspbench":
             return self._dexgraspbench(bench)
@@ -139,6 +152,15 @@ class Judge:
                 bench, state, _along(axis, 3), self.twist_rate, self.most_torque
             )
         return Judged(True, height, total, pulls, twists, passed=True)
+
+    def _law(self, robot: Robot) -> Law:
+        if callable(self.squeeze):
+            return self.squeeze
+        if self.squeeze == "hierarchy":
+            grip = Grip(robot, self.force, self.believed)
+            return lambda robot, grasp: grip.solve(grasp).torque
+        simple = SIMPLE[self.squeeze]
+        return lambda robot, grasp: simple(robot, grasp, self.force * grasp.k)
 
     def _pull(
         self,
@@ -190,8 +212,10 @@ class _Squeeze:
     def _wanted(self) -> np.ndarray:
         bench = self._bench
         self._felt = bench.grasp() or self._felt  # where a contact is lost, as it was before
-        wanted = np.clip(self._law(bench.robot, self._felt), -bench.strength, bench.strength)
-        return np.where(self._presses, wanted, 0.0)
+        wanted = self._law(bench.robot, self._felt)
+        if wanted is None:
+            return self._torque
+        return np.where(self._presses, np.clip(wanted, -bench.strength, bench.strength), 0.0)
 
     def cycle(self, told: np.ndarray, duration: float = CYCLE) -> bool:
         """Press on while the arm goes to `told` (n,) [rad]; whether the torques are there."""

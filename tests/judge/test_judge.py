@@ -8,7 +8,7 @@ import pytest
 import hqp_grasp as hg
 from hqp_grasp.errors import InputError
 from hqp_grasp.judge.bench import Bench
-from hqp_grasp.judge.judge import AXES, Judge, _slipped
+from hqp_grasp.judge.judge import AXES, SQUEEZES, Judge, _slipped
 from hqp_grasp.world.physics import Physics
 
 STACK = hg.ForceTask() >> hg.MomentTask() >> hg.KinematicTask()
@@ -134,6 +134,24 @@ def test_a_link_in_the_object_is_refused_before_anything_moves(scene, grasp):
 def test_what_is_no_size_is_refused(scene, name):
     with pytest.raises(InputError, match=f"Judge.{name} must be finite and above 0"):
         Judge(scene, five_newton, **{name: 0.0})
+
+
+@pytest.mark.parametrize("squeeze", SQUEEZES)
+def test_every_squeeze_lifts_a_balanced_grasp_with_the_strength_asked_for(scene, grasp, squeeze):
+    judged = Judge(scene, squeeze, force=5.0).judge(grasp)
+    assert judged.lifted
+    assert judged.sum_normal == pytest.approx(15.0, rel=0.1)
+
+
+def test_forces_by_the_hierarchy_grow_with_what_is_lifted(scene, grasp):
+    light, heavy = (Judge(scene, force=5.0, mass=mass).judge(grasp) for mass in (0.1, 1.0))
+    assert light.lifted and heavy.lifted
+    assert heavy.sum_normal >= 1.0 * GRAVITY / 0.5 > light.sum_normal  # friction believed: 0.5
+
+
+def test_an_unknown_squeeze_is_answered_with_those_there_are(scene):
+    with pytest.raises(InputError, match="choose one of: hierarchy, equal-torque, equal-normal"):
+        Judge(scene, "harder")
 
 
 def test_an_unknown_protocol_is_answered_with_those_there_are(scene):
