@@ -38,13 +38,14 @@ class Contact:
     """One place where the hand touches the object.
 
     Everything after `normal` is optional: a law that needs it says so. A contact belongs to a
-    contact point, not to a finger: any link of any robot can have one.
+    body, not to a finger: any link of any robot can hold one.
     """
 
     position: np.ndarray  # (3,) [m], world
     normal: np.ndarray  # (3,) unit, outward from the object, world
     name: str = ""  # the robot's contact point that touches
-    point: np.ndarray | None = None  # (3,) [m], link frame: the point whose motion `jacobian` gives
+    body: str = ""  # the link it belongs to
+    point: np.ndarray | None = None  # (3,) [m], body frame: the point whose motion `jacobian` gives
     flexion: tuple[int, ...] = ()  # γ_i: indices into q of the joints that press this contact
     tip_radius: float = 0.0  # [m] from `point` to the touching surface; 0 for a material point
     wrench: np.ndarray | None = None  # (6,) force [N], torque [N·m] on the tip, when sensed

@@ -12,7 +12,7 @@ import numpy as np
 from hqp_grasp.errors import ResultsError
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 
-FORMER = ("body", "confidence")  # of contacts in older files; nothing ever read them
+FORMER = ("confidence",)  # of contacts in older files; nothing ever read it
 GRASP = ("q", "jacobian", "hessian", "coupling", "offset")
 
 

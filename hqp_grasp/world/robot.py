@@ -439,7 +439,7 @@ class Robot:
 
         `contacts` has one Contact for each contact point, in the description's order: position and
         outward normal (world), perhaps wrench and noise; on a link that is no ball,
-        perhaps the `tip_radius` it is rounded by there. Name, point and flexion are the
+        perhaps the `tip_radius` it is rounded by there. Name, link, point and flexion are the
         robot's, and so are the grasp's Jacobian, Hessian and coupling; and the position too on a
         ball felt with noise, for joint angles tell its centre.
         """
@@ -463,6 +463,7 @@ class Robot:
                 replace(
                     contact,
                     name=point.name,
+                    body=self.model.body(int(self._bodies[i])).name,
                     point=places[i],
                     flexion=self.flexion[i],
                     tip_radius=radius,

@@ -140,15 +140,16 @@ def test_jacobian_hessian_and_coupling_are_the_robots_where_it_stands(world):
         np.testing.assert_array_equal(grasp.q_full, world.data.qpos)
 
 
-def test_each_contact_names_its_tip_and_the_point_on_it(world):
+def test_each_contact_names_its_tip_its_link_and_the_point_on_it(world):
     for grasp in world.grasps[:3]:
         world.robot.place(world.data, grasp.q)
         centers = world.robot.centers(grasp.q)
         for i, contact in enumerate(grasp.contacts):
             assert contact.name == f"finger_{i + 1}"
+            assert contact.body == f"f{i + 1}_tip"
             assert contact.tip_radius == 0.008
             assert contact.flexion == (world.robot.index(f"bhand_f{i + 1}_proximal"),)
-            body = world.data.body(f"f{i + 1}_tip")
+            body = world.data.body(contact.body)
             point = body.xpos + body.xmat.reshape(3, 3) @ contact.point
             np.testing.assert_allclose(point, centers[i], atol=EXACT)
 
