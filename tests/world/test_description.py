@@ -442,14 +442,15 @@ def test_the_check_takes_a_file_of_one_joint(tmp_path):
 
 
 OTHERS = (
-    '<body name="table" pos="0 0 -0.5"><geom name="top" type="box" size="1 1 .1"/></body>'
+    '<body name="table" pos="0 0 -0.5"><joint name="door"/>'
+    '<geom name="top" type="box" size="1 1 .1"/></body>'
     '<body name="cube" pos="1 0 0"><freejoint name="cube"/><geom size="0.02"/></body>'
     '<geom name="floor" type="plane" size="1 1 .1"/>'
 )
 
 
 def test_a_file_of_several_root_bodies_names_its_robot(tmp_path):
-    qpos = [*SIX, 1, 0, 0, 1, 0, 0, 0]
+    qpos = [*SIX, 0.7, 1, 0, 0, 1, 0, 0, 0]
     xml = six(qpos=qpos, inside=OTHERS).replace(
         "</mujoco>",
         '<equality><weld body1="palm" body2="cube"/></equality>'
@@ -505,7 +506,10 @@ def test_a_scene_moves_all_of_a_robot_and_keeps_frames(tmp_path):
     base = (0.0, 0.0, 1.0, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     xml = change(six(), '<body name="palm">', '<frame pos="1 0 0"><body name="palm">')
     xml = change(
-        xml, "</worldbody>", '</frame><geom name="foot" pos="2 0 0" size="0.1"/></worldbody>'
+        xml,
+        "</worldbody>",
+        '</frame><geom name="foot" pos="2 0 0" size="0.1"/><site name="mark" pos="2 0 0"/>'
+        "</worldbody>",
     )
     tiny_hand.write(tmp_path, xml, SIX_HAND.format(""))
     alone, moved = Scene(tmp_path).articulated, Scene(tmp_path, base=base).articulated
@@ -513,7 +517,8 @@ def test_a_scene_moves_all_of_a_robot_and_keeps_frames(tmp_path):
     np.testing.assert_allclose(alone.centers(alone.home), x, atol=EXACT)
     turned = np.column_stack([-x[:, 1], x[:, 0], x[:, 2] + 1.0])
     np.testing.assert_allclose(moved.centers(moved.home), turned, atol=EXACT)
-    np.testing.assert_allclose(moved.model.geom("foot").pos, [0, 2, 1], atol=EXACT)
+    for thing in (moved.model.geom("foot"), moved.model.site("mark")):
+        np.testing.assert_allclose(thing.pos, [0, 2, 1], atol=EXACT)
     toml = """
         [[model]]
         file = "tiny.xml"
@@ -590,8 +595,11 @@ def test_an_equality_that_binds_no_joint_is_let_be(tmp_path):
     off = WELD.replace("/>", ' active="false"/>')
     assert written(tmp_path, change(XML, "<equality>", f"<equality>{off}")).n == 2
     nail = change(XML, '<site name="tip_center"', '<body name="nail"/><site name="tip_center"')
-    nail = change(nail, "<equality>", f"<equality>{WELD.replace('palm', 'nail')}")
-    assert written(tmp_path, nail).n == 2
+    for end in ('body1="distal" body2="nail"', 'site1="tip_center" site2="other"'):
+        both = change(
+            nail, '<site name="tip_center"', '<site name="other"/><site name="tip_center"'
+        )
+        assert written(tmp_path, change(both, "<equality>", f"<equality><weld {end}/>")).n == 2
     mocap = change(FREE, "</worldbody>", '<body name="hook" mocap="true"/></worldbody>')
     mocap = change(mocap, "<equality>", '<equality><weld body1="hook" body2="palm"/>')
     assert written(tmp_path, mocap, 'lock = ["root"]\n' + SHORT).n == 1
@@ -652,22 +660,23 @@ def test_the_check_names_the_tendons_that_are_not_read(tmp_path):
     told = written(tmp_path, xml, line + "\n" + SHORT)
     np.testing.assert_array_equal(told.coupling, [[1, 0], [0, 1], [0, 1]])
     assert "pull" not in check(tmp_path)
-    both = check(
-        tiny_hand.write(
-            tmp_path,
-            change(
-                xml,
-                'coef="1"/></fixed>\n  <fixed name="stop"',
-                'coef="1"/><joint joint="lift" coef="1"/></fixed>\n  <fixed name="stop"',
-            ),
-            SHORT,
-        )
-    )
-    assert "drop_couplings = []  # keeps the files' own equalities" in both
+    # one that is limited is named still, and its joints are no longer asked about
+    limited = change(xml, 'name="pull"', 'name="pull" limited="true" range="0 1"')
+    text = check(tiny_hand.write(tmp_path, limited, line + "\n" + SHORT))
+    assert "pull over proximal, distal" in text and "couplings = [" not in text
+    lift = 'name="pull"><joint joint="lift" coef="1"/>'
+    text = check(tiny_hand.write(tmp_path, change(xml, 'name="pull">', lift), SHORT))
+    assert "drop_couplings = []  # keeps the files' own equalities" in text
     assert "tendons" not in check(tiny_hand.write(tmp_path, XML, SHORT))
 
 
 # ---------------------------------------------------------------- files as others save them
+
+
+def test_a_coupling_through_a_tendon_that_nothing_moves_is_refused(tmp_path):
+    slack = '<tendon><fixed name="slack"><joint joint="lift" coef="0"/></fixed></tendon><equality>'
+    xml = change(NO_KEYS, "<equality>", slack + '<tendon name="held" tendon1="slack"/>')
+    refused(lambda: written(tmp_path, xml), "equality held", "no joint moves")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
