@@ -187,3 +187,150 @@ def _general_bounds(rng, value, feasible, tight, ternary, still):
     if form < 0.95:
         return value - noise[0], value + noise[1]
     return -np.inf, np.inf
+
+
+# ---------------------------------------------------------------- forces, and many joints
+
+CONTACTS = (3, 5, 6, 8)
+EDGES = (4, 6, 8, 12, 16)  # of a friction pyramid
+FLOOR, CAP = 0.2, 15.0  # of a normal force: share of the mean, and [N]
+
+
+def forces(rng, k=None, edges=None):
+    """Contact forces of a grip, x = (f₁ … f_k [N], s₁ … s_k [N]): m ≫ n, and many rows tied.
+
+    Joint torques within their limits ▷ friction pyramids with margins s, each normal force between
+    a floor and a cap ▷ net force = felt ▷ Σ normal forces = k F ▷ each margin that of a pure
+    squeeze ▷ no net moment ▷ least force. Half of the contacts lie evenly about a drum or on two
+    faces of a box, the others anywhere on a ball.
+    """
+    k = int(rng.choice(CONTACTS)) if k is None else k
+    edges = int(rng.choice(EDGES)) if edges is None else edges
+    friction, mean = rng.uniform(0.2, 1.0), rng.uniform(1.0, 10.0)
+    p, frames = _contacts(rng, k)
+    normal = np.zeros((k, 4 * k))
+    cones, margins = np.zeros((k * edges, 4 * k)), np.eye(4 * k)[3 * k :]
+    for i, frame in enumerate(frames):
+        own = slice(3 * i, 3 * i + 3)
+        normal[i, own] = frame[0]
+        for j, angle in enumerate(2.0 * np.pi * np.arange(edges) / edges):
+            edge = np.cos(angle) * frame[1] + np.sin(angle) * frame[2]
+            cones[i * edges + j, own] = friction * frame[0] - edge
+        cones[i * edges : (i + 1) * edges, 3 * k + i] = -1.0
+    torques = _torques(rng, p)
+    limit = rng.uniform(0.5, 3.0)  # [N·m]
+    net = np.hstack([np.eye(3)] * k + [np.zeros((3, k))])
+    felt = rng.choice([0.0, 1.0, 5.0]) * (np.eye(3)[2] if rng.random() < 0.5 else _unit(rng))
+    lever = np.linalg.norm(p - p.mean(axis=0), axis=1).mean()
+    moment = np.hstack([_cross(each) / lever for each in p - p.mean(axis=0)] + [np.zeros((3, k))])
+    low = np.concatenate([np.zeros(k * edges + k), np.full(k, FLOOR * mean)])
+    high = np.concatenate([np.full(k * edges + k, np.inf), np.full(k, CAP)])
+    return [
+        Rows(torques, np.full(len(torques), -limit), np.full(len(torques), limit)),
+        Rows(np.concatenate([cones, margins, normal]), low, high),
+        equal(net, felt),
+        equal(normal.sum(axis=0)[None], [k * mean]),
+        equal(margins, np.full(k, friction * mean)),
+        equal(moment, np.zeros(3)),
+        equal(np.eye(4 * k)[: 3 * k], np.zeros(3 * k)),
+    ]
+
+
+def _unit(rng):
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+def _cross(v):
+    """v × as a matrix (3, 3)."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _contacts(rng, k):
+    """Places (k, 3) [m], and at each a frame of rows: inward normal and two tangents."""
+    size, shape = rng.uniform(0.03, 0.2), rng.random()
+    turns = 2.0 * np.pi * np.arange(k) / k
+    if shape < 0.25:  # about a drum
+        inward = -np.column_stack([np.cos(turns), np.sin(turns), np.zeros(k)])
+        p = -size * inward + rng.choice([0.0, 0.02]) * np.outer(np.arange(k) % 2, np.eye(3)[2])
+    elif shape < 0.5:  # on two faces of a box
+        side = 2.0 * (np.arange(k) % 2) - 1.0
+        inward = -np.outer(side, np.eye(3)[0])
+        p = -size * inward + np.outer(np.arange(k) // 2 * 0.025, np.eye(3)[1])
+    else:
+        inward = np.array([_unit(rng) for _ in range(k)])
+        p = -size * inward + 0.01 * rng.standard_normal((k, 3))
+    frames = []
+    for n in inward:
+        first = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+        first /= np.linalg.norm(first)
+        frames.append(np.array([n, first, np.cross(n, first)]))
+    return p, frames
+
+
+def _torques(rng, p):
+    """Jᵀ (joints, 4k) [m]: two to four joints of each finger, and none to seven of an arm."""
+    k = len(p)
+    rows = []
+    for i in range(k):
+        for _ in range(int(rng.integers(2, 5))):
+            rows.append(np.zeros(4 * k))
+            rows[-1][3 * i : 3 * i + 3] = rng.uniform(0.02, 0.12) * _unit(rng)
+    for _ in range(int(rng.integers(0, 8))):
+        axis, place = _unit(rng), 0.5 * rng.standard_normal(3)
+        rows.append(np.append(np.cross(axis, p - place).ravel(), np.zeros(k)))
+    return np.array(rows)
+
+
+def joints(rng, n=43):
+    """A step of a robot of many joints: most limits touch x = 0, some joints are locked by them.
+
+    Caps on joints and on tips ▷ ranges, some as narrow as rounding ▷ couplings, half of the time ▷
+    clearances ▷ where the tips go, and a damping.
+    """
+    tips = int(rng.integers(2, 6))
+    moving = rng.random(n) < rng.uniform(0.3, 1.0)
+    if not moving.any():
+        moving[0] = True
+    J = np.concatenate([_sparse(rng, n, moving, 3) for _ in range(tips)])
+    cap = np.concatenate([np.eye(n) / 0.35, J / 0.05])
+    before = _at_a_bound(rng, len(cap))
+    lower, upper = rng.uniform(-3.0, 0.0, n), rng.uniform(0.0, 3.0, n)
+    lower[rng.random(n) < 0.3] = 0.0
+    upper[(rng.random(n) < 0.3) & (lower < 0.0)] = 0.0
+    locked = np.flatnonzero(~moving)
+    dust = np.where(rng.random(len(locked)) < 0.25, rng.uniform(-1e-16, 1e-16, len(locked)), 0.0)
+    levels = [
+        Rows(cap, -1.0 - before, 1.0 - before),
+        Rows(
+            np.concatenate([np.eye(n), np.eye(n)[locked]]),
+            np.concatenate([lower, np.minimum(dust, 0.0)]),
+            np.concatenate([upper, np.maximum(dust, 0.0)]),
+        ),
+    ]
+    if rng.random() < 0.5:
+        count = int(rng.integers(1, 6))
+        pairs = rng.choice(np.flatnonzero(moving), (count, 2))
+        couplings = np.eye(n)[pairs[:, 0]] - rng.uniform(0.3, 1.5, (count, 1)) * np.eye(n)[pairs[:, 1]]
+        levels.append(equal(couplings, np.zeros(count)))
+    clear = np.concatenate([_sparse(rng, n, moving, 1) for _ in range(int(rng.integers(5, 46)))])
+    room = -rng.exponential(0.02, len(clear)) * (rng.random(len(clear)) < 0.8)
+    levels.append(Rows(0.1 * clear, room, np.full(len(clear), np.inf)))
+    goal = 0.02 * rng.standard_normal(len(J))
+    asked = equal(np.concatenate([J, 1e-2 * np.eye(n)]), np.append(goal, np.zeros(n)))
+    return [*levels, asked]
+
+
+def _sparse(rng, n, moving, m):
+    """Rows (m, n) [m/rad] of up to 13 joints of those that move."""
+    chain = rng.permutation(np.flatnonzero(moving))[:13]
+    rows = np.zeros((m, n))
+    rows[:, chain] = 0.2 * rng.standard_normal((m, len(chain)))
+    return rows
+
+
+def _at_a_bound(rng, m):
+    """What was used up of caps of ±1 (m,) [–]: nothing, some, or all of them to rounding."""
+    used = np.where(rng.random(m) < 0.5, 0.0, rng.uniform(-1.0, 1.0, m))
+    full = rng.random(m) < 0.2
+    return np.where(full, rng.choice([-1.0, 1.0], m) * (1.0 - rng.integers(0, 9, m) * 2.0**-53), used)

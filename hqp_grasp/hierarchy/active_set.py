@@ -30,8 +30,10 @@ from hqp_grasp.errors import InputError
 from hqp_grasp.hierarchy.certificate import EPS, ROUNDING
 from hqp_grasp.hierarchy.level import Stacked
 
+CHANCES = 3  # rounds in which many rows change although the last such round left no fewer
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 12  # at most; it converges in six or seven
+OVERHEAD = 10_000  # [multiply-adds] for a step of any size
 SMEAR = 4.0 * EPS  # [–] rounding of a row's entries after the turns, and of what is made up of them
 FEASIBLE = 1e-11  # [–] violation of a bound that is rounding, in units of |bound| + ‖a‖ ‖x‖
 SURE = 1e-1  # [–] share of a multiplier's uncertainty that it must exceed for its sign to decide
@@ -430,14 +432,17 @@ def _reduce(A, off, begin, end, o, frobenius, floor, work, x):
     Takes in levels begin … end − 1; those above are reduced. Directions before o are unknowns.
 
     What is left of a row, after it is reduced by c others, counts as nothing below ε c of
-    its length; singular values, below `floor` (p,) × ‖A_k‖₂ / ‖A_k‖_F.
+    its length; singular values, below `floor` (p,) × ‖A_k‖₂ / ‖A_k‖_F. Returns the multiply-adds
+    that it took, about.
     """
     V, W, Z, xq, xv, rhs = work.V, work.W, work.Z, work.xq, work.xv, work.rhs
     n = len(x)
     flat_v, flat_w, flat_z = work.flat_v, work.flat_w, work.flat_z
+    spent = 0
     for k in range(begin, end):
         c, lo, hi = work.first[k], work.start[k], work.start[k + 1]
         m = hi - lo
+        spent += 2 * m * n * (n - c)
         r = 0
         work.turned[k] = False
         if m > 0 and c < n and frobenius[k] > 0.0:
@@ -466,6 +471,8 @@ def _reduce(A, off, begin, end, o, frobenius, floor, work, x):
             if ambiguous:
                 tol = floor[k] * spectral_norm(A[off[k] : off[k + 1]]) / frobenius[k]
                 made = r
+                most, least = max(off[k + 1] - off[k], n), min(off[k + 1] - off[k], n)
+                spent += JACOBI_SWEEPS * (3 * most * least * least + 6 * r * r * (m + r))
                 r = _rotate(lo, hi, c, o, r, tol, work)
                 work.turned[k] = r < made
         for i in range(lo, hi):
@@ -485,6 +492,7 @@ def _reduce(A, off, begin, end, o, frobenius, floor, work, x):
         work.first[k + 1] = c + r
     for j in range(n):
         x[work.order[j]] = xv[j]
+    return spent
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -704,11 +712,11 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
 
 
 @njit(cache=True, error_model="numpy")
-def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks, steps):
+def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks, budget):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
-    See `search`. Returns x (n,), the multipliers (M, p + 1) explained at `_column`, rank (p,) and
-    the number of steps.
+    See `search`. Returns x (n,), the multipliers (M, p + 1) explained at `_column`, rank (p,), the
+    number of steps and the multiply-adds that they took.
     """
     M, n = A.shape
     p = len(off) - 1
@@ -718,6 +726,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
     side, wrong = work.side, work.wrong
     x = np.zeros(n)
     start = np.zeros(n)  # the point that the steps of one row have reached
+    settled = act.copy()  # the active set of the levels before
     kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
     last = -1  # row and side let go in the step before
     last_side = 0
@@ -730,10 +739,14 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
     o = 0
     single = blocks == 0
     fewest = M + 1
-    begun = 0  # the step at which these levels began,
-    alone = 0  # and one row at a time
-    for step in range(steps + 1):
-        last_step = step == steps  # what is found there is returned as it is
+    chances = CHANCES
+    begun = 0  # the step at which these levels began
+    spent = 0  # multiply-adds,
+    alone = 0  # and those before rows moved one at a time
+    step = -1
+    while True:
+        step += 1
+        last_step = spent >= budget  # what is found there is returned as it is
         if last_step:
             levels = p
         if reduced < 0:
@@ -741,7 +754,8 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
             o = work.first[reduced]
         levels = max(levels, reduced)
         end = off[levels]
-        _reduce(A, off, reduced, levels, o, frobenius, floor, work, x)
+        spent += OVERHEAD + end * n
+        spent += _reduce(A, off, reduced, levels, o, frobenius, floor, work, x)
         reduced = levels
         length = np.sqrt(_dot(x, 0, x, 0, n))
         for k in range(levels):
@@ -751,8 +765,9 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
         unwilling = 0
         drop = -1
         if not single or block < 0 or last_step:
-            late = 2 * (step - alone) > steps  # Bland: the first one, so that it ends
+            late = 2 * (spent - alone) > budget  # Bland: the first one, so that it ends
             _complete(levels, o, work)
+            spent += work.start[levels] * n * (levels + 1)
             unwilling, drop = _unwilling(
                 off,
                 levels,
@@ -774,6 +789,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
                 break
             levels += 1
             start[:] = x
+            settled[:] = act
             single = blocks == 0
             fewest = M + 1
             begun = step + 1
@@ -782,16 +798,26 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
             continue
         reduced = -1
         if not single:
-            if count < fewest and step + 1 < begun + blocks:
-                fewest = count
-                for i in range(end):
+            if step + 1 < begun + blocks:
+                if count < fewest:
+                    fewest, chances = count, CHANCES
+                else:
+                    chances -= 1
+                for i in range(end - 1, -1, -1):
                     if wrong[i] == 1:
                         act[i] = 0
                     elif side[i] != 0:
                         act[i] = side[i]
+                    else:
+                        continue
+                    if chances < 0:
+                        break
                 continue
-            single = True
-            alone = step
+            single = True  # from where the levels before were settled
+            alone = spent
+            if begun > 0:
+                act[:] = settled
+                continue
         if block >= 0:
             for j in range(n):
                 start[j] += alpha * (x[j] - start[j])
@@ -806,22 +832,25 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
             start[:] = x
             last, last_side = drop, act[drop]
             act[drop] = 0
-    return x, work.lam, work.first[1:] - work.first[:-1], step
+    return x, work.lam, work.first[1:] - work.first[:-1], step, spent
 
 
 def search(
-    rows: Stacked, act: np.ndarray, first: int, blocks: int, steps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    rows: Stacked, act: np.ndarray, first: int, blocks: int, budget: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     Begins with the first `first` levels and takes in the next where these are settled. At each:
-    up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign
-    at once, for as long as there are ever fewer of them. Then steps that move one row each, as
-    the primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
-    Sherikov & Wieber 2015); with blocks = 0 it is that method, from x = 0. Ends after `steps` at
-    the latest; whether it found the optimum is for the certificate to say.
+    up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign at
+    once; where that leaves no fewer of them `CHANCES` times, only the last of them, until there are
+    fewer again (block principal pivoting, Júdice & Pires 1994). Where the rounds do not settle it,
+    steps from where the levels before were settled that move one row each, as the primal method
+    does that improves the levels in their order at every step (LexLSI, Dimitrov, Sherikov & Wieber
+    2015); with blocks = 0 it is that method, from x = 0. Ends when `budget` multiply-adds, about,
+    are spent; whether it found the optimum is for the certificate to say.
 
-    Returns x (n,), the multipliers (M, p + 1) that should prove it, rank (p,), and the steps made.
+    Returns x (n,), the multipliers (M, p + 1) that should prove it, rank (p,), the steps made, and
+    the multiply-adds spent.
     """
     if act.shape != rows.lower.shape or act.dtype != np.int8:
         raise InputError(
@@ -838,11 +867,5 @@ def search(
         rows.floor,
         first,
         blocks,
-        steps,
+        budget,
     )
-
-
-def work_of_a_step(rows: Stacked) -> int:
-    """Multiply-adds of one step of `search`, about, with what a step of any size takes."""
-    M, n = rows.A.shape
-    return M * n * (n + len(rows.frobenius)) + 100_000

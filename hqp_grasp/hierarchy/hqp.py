@@ -80,9 +80,12 @@ class HQP:
         rows = stack(levels, self.rank_tolerance)
         failed: list[str] = []
         found: list[tuple[tuple[int, float], Solution]] = []
-        steps = 1 + self.budget // (3 * active_set.work_of_a_step(rows))
+        left = self.budget
         for method, seen, act, first, rounds in self._ways(rows, warm, failed):
-            x, multipliers, rank, _ = active_set.search(seen, act, first, rounds, steps)
+            x, multipliers, rank, _, spent = active_set.search(
+                seen, act, first, rounds, left // 2
+            )
+            left -= min(spent, left)
             judged = optimality(rows, x, multipliers, shortest=True)
             off = rows.offsets.tolist()
             reports = [

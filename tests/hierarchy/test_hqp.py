@@ -309,7 +309,7 @@ def test_a_warm_start_from_its_own_answer_needs_one_step(monkeypatch):
 
     def counted(*arguments):
         found = search(*arguments)
-        made.append(found[-1])
+        made.append(found[-2])
         return found
 
     monkeypatch.setattr(active_set, "search", counted)
@@ -480,7 +480,7 @@ def searching(monkeypatch, failures):
             return search(rows, act, *arguments)
         left[0] -= 1
         M, n, p = *rows.A.shape, len(rows.frobenius)
-        return np.zeros(n), np.zeros((M, p + 1)), np.zeros(p, np.int64), 0
+        return np.zeros(n), np.zeros((M, p + 1)), np.zeros(p, np.int64), 0, 1
 
     monkeypatch.setattr(active_set, "search", first_in_vain)
 
@@ -754,7 +754,7 @@ def test_of_uncertified_answers_the_one_that_serves_most_levels_is_returned(alon
     tries = iter([[2.0, 0.0], [0.5, 0.0], [3.0, 3.0], [np.nan, 0.5]])
 
     def fake(rows, act, *_):
-        return np.array(next(tries)), np.zeros((len(act), 3)), np.zeros(2, np.int64), 1
+        return np.array(next(tries)), np.zeros((len(act), 3)), np.zeros(2, np.int64), 1, 1
 
     monkeypatch.setattr(active_set, "search", fake)
     answer = HQP("daqp").solve(built([box(2, 1.0), equal(np.eye(2), [0.5, 0.5])]))
@@ -764,7 +764,7 @@ def test_of_uncertified_answers_the_one_that_serves_most_levels_is_returned(alon
 
 def test_only_where_nothing_finite_is_found_is_there_no_answer(monkeypatch):
     def fake(rows, act, *_):
-        return np.full(2, np.nan), np.zeros((len(act), 3)), np.zeros(2, np.int64), 1
+        return np.full(2, np.nan), np.zeros((len(act), 3)), np.zeros(2, np.int64), 1, 1
 
     monkeypatch.setattr(active_set, "search", fake)
     with pytest.raises(SolverError, match="no way led to a finite x"):
