@@ -3,7 +3,8 @@
     python benchmarks/fuzz.py --problems 100000 --seed 0 --solver daqp --jobs 2
 
 An answer is certified, or says that it is not; at most 10 of 100,000 may have to. The general kind
-draws rank tolerances too, and rows of rounding dust.
+draws rank tolerances too, and rows of rounding dust; forces and joints are of the shapes that hands
+and whole robots pose.
 
 Problem i of seed s draws from SeedSequence([s, i]) and from nothing else, so that a failure listed
 as `i` is repeated by `--seed s --first i --problems 1`. The answer may also be compared with the
@@ -32,7 +33,7 @@ from hqp_grasp import HQP, InputError, Level
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from oracle import OracleError, lexicographic_optimum
-from problems import Rows, anything, near_singular_at_any_angle, three_level
+from problems import Rows, anything, forces, joints, near_singular_at_any_angle, three_level
 
 CHUNK = 50  # problems handed to a worker at once
 SHOWN = 40  # failures listed at most
@@ -53,10 +54,19 @@ class Options:
     solver: str = "proxqp"
     """What solves them."""
     kind: Literal[
-        "general", "three_level-easy", "three_level-mid", "three_level-hard", "near_singular"
-    ] = "general"
-    """general: n 1–40, 1–8 levels, anything goes. three_level: 11 unknowns, a box, three tasks.
-    near_singular: two of three tasks at an angle of 1e-1 … 1e-16 rad."""
+        "all",
+        "general",
+        "forces",
+        "joints",
+        "three_level-easy",
+        "three_level-mid",
+        "three_level-hard",
+        "near_singular",
+    ] = "all"
+    """all: a tenth forces, a tenth joints, the others general. general: n 1–40, 1–8 levels,
+    anything goes. forces: of 3, 5, 6 or 8 contacts, pyramids of 4–16 edges, torques within a box.
+    joints: a step of 43, most limits touched, couplings. three_level: 11 unknowns, a box, three
+    tasks. near_singular: two of three tasks at an angle of 1e-1 … 1e-16 rad."""
     against_oracle: bool = False
     """Compare with the reference optimum too (some 20 problems a second and job)."""
     budget: int = HQP().budget
@@ -80,8 +90,12 @@ class Outcome:
 def make(kind: str, seed: int, index: int) -> tuple[list[Rows], float | None]:
     """The problem that (kind, seed, index) names, and its rank tolerance."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
+    if kind == "all":
+        kind = str(rng.choice(["forces", "joints", "general"], p=[0.1, 0.1, 0.8]))
     if kind == "general":
         return anything(rng)
+    if kind in ("forces", "joints"):
+        return (forces if kind == "forces" else joints)(rng), None
     if kind == "near_singular":
         return near_singular_at_any_angle(rng), None
     return three_level(rng, kind.removeprefix("three_level-")), None

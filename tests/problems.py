@@ -311,7 +311,8 @@ def joints(rng, n=43):
     if rng.random() < 0.5:
         count = int(rng.integers(1, 6))
         pairs = rng.choice(np.flatnonzero(moving), (count, 2))
-        couplings = np.eye(n)[pairs[:, 0]] - rng.uniform(0.3, 1.5, (count, 1)) * np.eye(n)[pairs[:, 1]]
+        ratios = rng.uniform(0.3, 1.5, (count, 1))
+        couplings = np.eye(n)[pairs[:, 0]] - ratios * np.eye(n)[pairs[:, 1]]
         levels.append(equal(couplings, np.zeros(count)))
     clear = np.concatenate([_sparse(rng, n, moving, 1) for _ in range(int(rng.integers(5, 46)))])
     room = -rng.exponential(0.02, len(clear)) * (rng.random(len(clear)) < 0.8)
@@ -333,4 +334,6 @@ def _at_a_bound(rng, m):
     """What was used up of caps of ±1 (m,) [–]: nothing, some, or all of them to rounding."""
     used = np.where(rng.random(m) < 0.5, 0.0, rng.uniform(-1.0, 1.0, m))
     full = rng.random(m) < 0.2
-    return np.where(full, rng.choice([-1.0, 1.0], m) * (1.0 - rng.integers(0, 9, m) * 2.0**-53), used)
+    return np.where(
+        full, rng.choice([-1.0, 1.0], m) * (1.0 - rng.integers(0, 9, m) * 2.0**-53), used
+    )

@@ -30,7 +30,6 @@ from hqp_grasp.errors import InputError
 from hqp_grasp.hierarchy.certificate import EPS, ROUNDING
 from hqp_grasp.hierarchy.level import Stacked
 
-CHANCES = 3  # rounds in which many rows change although the last such round left no fewer
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 12  # at most; it converges in six or seven
 OVERHEAD = 10_000  # [multiply-adds] for a step of any size
@@ -726,7 +725,8 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
     side, wrong = work.side, work.wrong
     x = np.zeros(n)
     start = np.zeros(n)  # the point that the steps of one row have reached
-    settled = act.copy()  # the active set of the levels before
+    settled_act = act.copy()  # where the levels before were settled
+    settled_x = x.copy()
     kept = np.zeros(M, np.bool_)  # rows that hold x although their multipliers seem to say no
     last = -1  # row and side let go in the step before
     last_side = 0
@@ -739,8 +739,8 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
     o = 0
     single = blocks == 0
     fewest = M + 1
-    chances = CHANCES
-    begun = 0  # the step at which these levels began
+    returns = -1  # the step that goes back to where the levels before were settled,
+    begun = 0  # and the one at which these levels began
     spent = 0  # multiply-adds,
     alone = 0  # and those before rows moved one at a time
     step = -1
@@ -789,7 +789,9 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
                 break
             levels += 1
             start[:] = x
-            settled[:] = act
+            settled_act[:] = act
+            settled_x[:] = x
+            returns = -1
             single = blocks == 0
             fewest = M + 1
             begun = step + 1
@@ -798,26 +800,23 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
             continue
         reduced = -1
         if not single:
-            if step + 1 < begun + blocks:
-                if count < fewest:
-                    fewest, chances = count, CHANCES
-                else:
-                    chances -= 1
-                for i in range(end - 1, -1, -1):
+            if count < fewest and step + 1 < begun + blocks:
+                fewest = count
+                for i in range(end):
                     if wrong[i] == 1:
                         act[i] = 0
                     elif side[i] != 0:
                         act[i] = side[i]
-                    else:
-                        continue
-                    if chances < 0:
-                        break
                 continue
-            single = True  # from where the levels before were settled
+            single = True
             alone = spent
-            if begun > 0:
-                act[:] = settled
-                continue
+            returns = step + n if begun > 0 else -1
+        if step == returns:
+            act[:] = settled_act
+            start[:] = settled_x
+            kept[:] = False
+            last = -1
+            continue
         if block >= 0:
             for j in range(n):
                 start[j] += alpha * (x[j] - start[j])
@@ -842,12 +841,12 @@ def search(
 
     Begins with the first `first` levels and takes in the next where these are settled. At each:
     up to `blocks` rounds that take in every row x breaks and let go every row of wrong sign at
-    once; where that leaves no fewer of them `CHANCES` times, only the last of them, until there are
-    fewer again (block principal pivoting, Júdice & Pires 1994). Where the rounds do not settle it,
-    steps from where the levels before were settled that move one row each, as the primal method
-    does that improves the levels in their order at every step (LexLSI, Dimitrov, Sherikov & Wieber
-    2015); with blocks = 0 it is that method, from x = 0. Ends when `budget` multiply-adds, about,
-    are spent; whether it found the optimum is for the certificate to say.
+    once, for as long as there are ever fewer of them. Then steps that move one row each, as the
+    primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
+    Sherikov & Wieber 2015): from there, where few rows are wrong, and when that has taken n steps
+    from where the levels before were settled, which is surer. With blocks = 0 it is that method
+    from x = 0. Ends when `budget` multiply-adds, about, are spent; whether it found the optimum is
+    for the certificate to say.
 
     Returns x (n,), the multipliers (M, p + 1) that should prove it, rank (p,), the steps made, and
     the multiply-adds spent.

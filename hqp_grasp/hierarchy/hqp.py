@@ -82,9 +82,7 @@ class HQP:
         found: list[tuple[tuple[int, float], Solution]] = []
         left = self.budget
         for method, seen, act, first, rounds in self._ways(rows, warm, failed):
-            x, multipliers, rank, _, spent = active_set.search(
-                seen, act, first, rounds, left // 2
-            )
+            x, multipliers, rank, _, spent = active_set.search(seen, act, first, rounds, left // 2)
             left -= min(spent, left)
             judged = optimality(rows, x, multipliers, shortest=True)
             off = rows.offsets.tolist()

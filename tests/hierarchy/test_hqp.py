@@ -7,7 +7,19 @@ import numpy as np
 import proxsuite
 import pytest
 from oracle import lexicographic_optimum
-from problems import Rows, anything, box, equal, general, near_singular, scaling, three_level
+from problems import (
+    CONTACTS,
+    Rows,
+    anything,
+    box,
+    equal,
+    forces,
+    general,
+    joints,
+    near_singular,
+    scaling,
+    three_level,
+)
 from test_oracle import HAND
 
 import hqp_grasp
@@ -505,10 +517,37 @@ def test_before_an_uncertified_answer_goes_out_the_other_solvers_are_asked(monke
 LANDING = np.load(Path(__file__).with_name("landing.npz"))
 
 
+@pytest.mark.parametrize("k", CONTACTS)
+def test_the_search_by_itself_finds_the_forces_of_any_number_of_contacts(k):
+    """Once 0 of 40 of eight contacts: many rows at a bound at once, m ≫ n."""
+    for seed in range(12):
+        answer = solve(forces(np.random.default_rng([k, seed]), k), "active-set")
+        assert answer.method == "active-set", (seed, answer.failed)
+
+
+def test_the_search_by_itself_finds_a_step_of_many_joints_at_their_limits():
+    for seed in range(40):
+        problem = joints(np.random.default_rng(seed))
+        answer = solve(problem, "active-set")
+        assert answer.method == "active-set", (seed, answer.failed)
+        for level in built(problem[:2]):
+            assert np.abs(level.residual(answer.x)).max() <= TOL * units(level, answer.x)
+
+
+@pytest.mark.parametrize("k", [3, 8])
+def test_forces_are_the_same_whoever_finds_them(k):
+    for seed in range(4):
+        problem = forces(np.random.default_rng([9, k, seed]), k, edges=8)
+        found = [solve(problem, name).x for name in THREE]
+        for x in found[1:]:
+            assert_same_point(x, found[0])
+
+
 def test_a_correction_of_43_joints_at_many_bounds_at_once_keeps_its_limits(solver):
     """Levels of a step's landing, once answered 0.036 rad outside a range that x = 0 keeps."""
     problem = [Rows(v[:, :-2], v[:, -2], v[:, -1]) for v in LANDING.values()]
     answer = solve(problem, solver)
+    assert answer.method == solver, answer.failed
     for level in built(problem[:3]):
         assert np.abs(level.residual(np.zeros(43))).max() == 0.0
         assert np.abs(level.residual(answer.x)).max() <= TOL * units(level, answer.x)
