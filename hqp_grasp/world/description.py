@@ -153,6 +153,26 @@ class ModelFile:
             if not np.isfinite(key.qpos).all():
                 raise ModelError(f"{where} has qpos {np.array(key.qpos)}, not all finite")
 
+    def unusable_ranges(self, spec: mujoco.MjSpec) -> dict[str, tuple[float, float]]:
+        """Of each joint that MuJoCo would leave without range, as the file's is none [rad, m]."""
+        if self.is_urdf:
+            stated = {
+                joint.get("name")
+                for joint in ET.parse(self.file).getroot().iter("joint")
+                if joint.get("type") in ("revolute", "prismatic")
+                for limit in joint.findall("limit")
+                if {"lower", "upper"} & set(limit.keys())
+            }
+        else:
+            off = mujoco.mjtLimited.mjLIMITED_FALSE
+            stated = {j.name for j in spec.joints if j.limited != off and j.range.any()}
+        slide, unit = mujoco.mjtJoint.mjJNT_SLIDE, _angle_unit(spec)
+        return {
+            joint.name: tuple(joint.range * (1.0 if joint.type == slide else unit))
+            for joint in spec.joints
+            if joint.name in stated and not joint.range[0] < joint.range[1]
+        }
+
     def _refuse_radians(self, spec: mujoco.MjSpec) -> None:
         """Raise where a file that does not name its unit lists radians: MuJoCo takes degrees."""
         hinges = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
@@ -373,6 +393,7 @@ class RobotDescription:
     def _part(self, part: ModelFile) -> tuple[mujoco.MjSpec, set[str]]:
         """One of the files, without keyframes, and the free bases that `lock` fixed in it."""
         spec, fixed = part.spec(), set()
+        self._refuse_ranges(part, spec)
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
         for joint in [j for j in spec.joints if j.type == FREE]:
             name, body = part.prefix + joint.name, joint.parent
@@ -395,6 +416,18 @@ class RobotDescription:
         for key in list(spec.keys):
             spec.delete(key)
         return spec, fixed
+
+    def _refuse_ranges(self, part: ModelFile, spec: mujoco.MjSpec) -> None:
+        """Raise for a range that is reversed, a single angle, or no number."""
+        for joint, (low, high) in part.unusable_ranges(spec).items():
+            name = part.prefix + joint
+            if name not in self.ranges and name not in self.lock:
+                right = f"[{high:g}, {low:g}]" if low > high else "[LOW, HIGH]"
+                raise ModelError(
+                    f"joint {name!r} of {part.file.name} has the range [{low:g}, {high:g}], which "
+                    f'MuJoCo would drop: say ranges = {{ "{name}" = {right} }} in rad or m, or '
+                    f'lock = ["{name}"]'
+                )
 
     def _put_on_carriage(self, spec: mujoco.MjSpec) -> None:
         """Six joints at the root: at zero the palm is held as a drawn start holds it."""
@@ -668,7 +701,7 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         lock=_texts(data.get("lock", [])),
         couplings=tuple(_coupling(c) for c in data.get("couplings", [])),
         drop_couplings=drop if isinstance(drop, bool) else _texts(drop),
-        ranges={j: _range(f"ranges of {j}", v) for j, v in data.get("ranges", {}).items()},
+        ranges={j: _joint_range(j, v) for j, v in data.get("ranges", {}).items()},
         carriage=_flag("carriage", data.get("carriage", False)),
         workspace=None if workspace is None else _vector("workspace", workspace),
         clearance=_clearance(data.get("clearance", CLEARANCE)),
@@ -880,6 +913,16 @@ def _range(name: str, value: object) -> tuple[float, float]:
     low, high = as_array(name, value, (2,)).tolist()
     if not low <= high:
         raise InputError(f"{name} must be [low, high]; got {value!r}")
+    return low, high
+
+
+def _joint_range(joint: str, value: object) -> tuple[float, float]:
+    low, high = _range(f"ranges of {joint}", value)
+    if low == high:
+        raise InputError(
+            f'ranges of {joint} must be [low, high], low < high; lock = ["{joint}"] holds it at '
+            f"home, home = {{ {joint} = {low:g} }} puts it there"
+        )
     return low, high
 
 

@@ -36,7 +36,10 @@ HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE
 
 PARALLEL = 0.7  # [–] cosine of two joint axes that bend a finger alike
 SLIDE_UNIT = 0.06  # [m] a slide closes by while a hinge closes by 1 rad
-UNLIMITED = 1.0  # [rad] a joint without range opens and closes by from where it is
+STRAIGHT = 0.5  # [–] cosine above which a point goes for the others rather than across
+LEAN = 0.5  # [rad] a range that goes no further on one side than this bends to the other
+STEPS = 10  # places along 1 rad of closing in which the nearest is looked for
+UNLIMITED = 1.0  # [rad, m] a joint without range opens and closes by from where it is
 HELD = 1e-9  # [rad] rounding, of a joint that is held at the end of its range
 CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
 
@@ -225,7 +228,7 @@ class Robot:
         return closing
 
     def _guessed_closing(self, i: int, independent: list[int], moves: np.ndarray) -> np.ndarray:
-        """The joints that bend a finger: those parallel to its last one, towards its wider side."""
+        """The joints that bend a finger: the last one, and those parallel to it."""
         point = self.description.contact_points[i]
         own = [
             j
@@ -242,19 +245,47 @@ class Robot:
         weights = np.zeros(self.n)
         axes = self._at(self.home).xaxis[independent]
         last = own[-1]
+        slides = not self._hinge[independent[last]]
+        if slides:
+            weights[last] = SLIDE_UNIT
+        for j in own if not slides else ():
+            cosine = float(axes[j] @ axes[last])
+            if self._hinge[independent[j]] and abs(cosine) > PARALLEL:
+                weights[j] = np.sign(cosine)
+        return self._towards_others(i, weights, last, slides) * weights
+
+    def _towards_others(self, i: int, weights: np.ndarray, last: int, slides: bool) -> float:
+        """1 where moving q by `weights` (n,) [rad, m] from home closes point i, −1 where it opens.
+
+        It closes as it goes straight for the other points. Where it goes across, as a straight
+        finger does, it closes to the side on which it comes nearer within the ranges, but a hinge
+        not to one on which it can only lean. Where it comes nearer on neither side, a slide is
+        closed already, and a hinge turns to its wider side.
+        """
+        x = self.centers(self.home)
+        to = np.delete(x, i, axis=0) - x[i]
+        apart = np.linalg.norm(to, axis=1)
+        v = self.jacobian(self.home)[3 * i : 3 * i + 3] @ weights
+        approach = float((to @ v / np.maximum(apart, CENTRED)).sum())
+        if abs(approach) > STRAIGHT * len(to) * np.linalg.norm(v):
+            return float(np.sign(approach))
+
+        closed = bool((apart < CENTRED).any())
         low, high = self.q_lower[last], self.q_upper[last]
-        if self._hinge[independent[last]]:
-            towards = 1.0 if not low + high < 0.0 else -1.0
-            for j in own:
-                cosine = float(axes[j] @ axes[last])
-                if self._hinge[independent[j]] and abs(cosine) > PARALLEL:
-                    weights[j] = towards * np.sign(cosine)
-        else:
-            ends = self.home.copy(), self.home.copy()
-            ends[0][last], ends[1][last] = low, high
-            apart = [np.linalg.norm(x - x[i], axis=1).sum() for x in map(self.centers, ends)]
-            weights[last] = 1.0 if apart[1] < apart[0] else -1.0
-        return weights
+        wider = 1.0 if high >= -low else -1.0
+        if not slides and not closed and min(-low, high) < LEAN:
+            return wider
+
+        def gap(share: float) -> float:
+            q = np.clip(self.home + share * weights, self.q_lower, self.q_upper)
+            return float(np.linalg.norm(self.centers(q) - self.centers(q)[i], axis=1).sum())
+
+        shares = np.linspace(0.0, 1.0, STEPS + 1)
+        there, back = [gap(share) for share in shares], [gap(-share) for share in shares]
+        less = min(back) - min(there)
+        if abs(less) < CENTRED and (slides or closed):
+            less = back[-1] - there[-1]
+        return float(np.sign(less)) if abs(less) >= CENTRED else wider
 
     def _find_palm(self) -> tuple[int, np.ndarray, np.ndarray]:
         """Body of the palm, and where on it p (3,), R (3, 3): z approach axis, x opposition."""
@@ -654,8 +685,9 @@ def _reach(model: mujoco.MjModel, link: _Link) -> np.ndarray:
             else:
                 bound[j] = 1.0
         for j in range(first, first + model.body_jntnum[body]) if first >= 0 else ():
-            if model.jnt_type[j] == SLIDE and model.jnt_limited[j]:
-                far += float(np.abs(model.jnt_range[j]).max())
+            if model.jnt_type[j] == SLIDE:
+                travel = float(np.abs(model.jnt_range[j]).max()) if model.jnt_limited[j] else np.inf
+                far += travel if np.isfinite(travel) else UNLIMITED
         far += float(np.linalg.norm(model.body_pos[body]))
         body = int(model.body_parentid[body])
     return bound

@@ -17,7 +17,7 @@ from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.description import CCD_TOLERANCE, RobotDescription, locate
 from hqp_grasp.world.objects import Cylinder
-from hqp_grasp.world.robot import Robot, compiled, described
+from hqp_grasp.world.robot import SLIDE_UNIT, Robot, compiled, described
 from hqp_grasp.world.scene import Scene
 from hqp_grasp.world.second_opinion import second_opinion
 
@@ -33,16 +33,21 @@ FINGER = """<link name="{n}"><inertial><mass value="1"/><inertia ixx="1" iyy="1"
     <collision><origin xyz="0 0 0.1"/><geometry>{shape}</geometry></collision></link>
   <joint name="{n}_joint" type="revolute"><parent link="base"/><child link="{n}"/>
     <origin xyz="{x} 0 0"/><axis xyz="0 {s} 0"/>
-    <limit lower="0" upper="1.5" effort="1" velocity="1"/></joint>"""
+    <limit {limit} effort="1" velocity="1"/></joint>"""
 BALL, BOX = '<sphere radius="0.01"/>', '<box size="0.02 0.03 0.04"/>'
 
 
-def claw(folder, shape=BALL, toml=""):
-    """Two fingers that close towards one another, from a URDF."""
+LIMIT = 'lower="0" upper="1.5"'
+
+
+def claw(folder, shape=BALL, toml="", limit=LIMIT, right=-1, kind="revolute", apart=0.06):
+    """Two fingers from a URDF that close towards one another, for `right` = −1 positively."""
     fingers = [
-        FINGER.format(n=n, x=x, s=s, shape=shape)
-        for n, x, s in (("left", -0.06, 1), ("right", 0.06, -1))
+        FINGER.format(n=n, x=x, s=s, shape=shape, limit=limit).replace("revolute", kind)
+        for n, x, s in (("left", -apart, 1), ("right", apart, right))
     ]
+    if kind == "prismatic":
+        fingers = [re.sub('xyz="0 (-?1) 0"', r'xyz="\1 0 0"', finger) for finger in fingers]
     (folder / "claw.urdf").write_text(URDF.format(fingers="".join(fingers)))
     points = '[[contact_points]]\nlink = "left"\n[[contact_points]]\nlink = "right"\n'
     (folder / "claw.toml").write_text(f'model = "claw.urdf"\n{toml}\n{points}')
@@ -96,6 +101,78 @@ def test_a_joint_whose_wide_side_is_negative_closes_negatively(tmp_path):
     xml = change(XML, 'axis="0 0 1" range="0 3"', 'axis="0 0 1" range="-3 0"')
     xml = change(change(xml, 'range="-0.1 0.8"', 'range="-2 2"'), 'qpos="0 0.2', 'qpos="0 -0.2')
     np.testing.assert_array_equal(written(tmp_path, xml).closing, [[0.0, -1.0]])
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("right", [1, -1])
+@pytest.mark.parametrize("limit", ["", LIMIT, 'lower="-1" upper="1"', 'lower="-2" upper="1"'])
+def test_fingers_close_towards_one_another_whichever_way_their_axes_point(
+    tmp_path, kind, right, limit
+):
+    """Also without ranges, and where the wider side of a range leads away."""
+    robot = robot_of(claw(tmp_path, limit=limit, right=right, kind=kind))
+    unit = 1.0 if kind == "revolute" else SLIDE_UNIT
+    np.testing.assert_allclose(robot.closing, unit * np.diag([1.0, -right]), atol=EXACT)
+    assert np.isfinite([robot.opened(robot.home, share) for share in (0.0, 1.0)]).all()
+
+
+@pytest.mark.parametrize(
+    ("apart", "limit"),
+    [
+        (0.06, 'lower="-0.05" upper="0"'),
+        (0.011, 'lower="-0.05" upper="0"'),
+        (0.011, 'lower="-0.01" upper="0.3"'),
+        (0.0, 'lower="-0.05" upper="0"'),  # one place, and so no direction
+    ],
+)
+def test_jaws_close_towards_one_another_wherever_home_is(tmp_path, apart, limit):
+    """Where they are closed at home, they close against the end of their range."""
+    robot = robot_of(claw(tmp_path, limit=limit, kind="prismatic", apart=apart))
+    np.testing.assert_allclose(robot.closing, SLIDE_UNIT * np.eye(2), atol=EXACT)
+
+
+def test_hinges_closed_at_home_close_against_the_end_of_their_range(tmp_path):
+    robot = robot_of(claw(tmp_path, limit='lower="-1.5" upper="0"', apart=0.01))
+    np.testing.assert_array_equal(robot.closing, np.eye(2))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_fingers_side_by_side_bend_to_their_wider_side(tmp_path, sign):
+    """Without a thumb nothing but the ranges tells."""
+    low, high = sorted((-0.2 * sign, 1.5 * sign))
+    path = claw(tmp_path, limit=f'lower="{low}" upper="{high}"', right=1)
+    urdf = tmp_path / "claw.urdf"
+    urdf.write_text(urdf.read_text().replace('axis xyz="0 1 0"', 'axis xyz="1 0 0"'))
+    np.testing.assert_array_equal(robot_of(path).closing, sign * np.eye(2))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_finger_that_goes_across_closes_to_where_it_comes_nearer(tmp_path, sign):
+    """The thumb a little behind the plane of the straight finger, which it bends away from."""
+    low, high = sorted((-0.2 * sign, 1.5 * sign))
+    ranges = f"ranges = {{ left_joint = [{low}, {high}] }}"
+    path = claw(tmp_path, limit='lower="-1.5" upper="1.5"', right=1, toml=ranges)
+    urdf = tmp_path / "claw.urdf"
+    text = urdf.read_text().replace('axis xyz="0 1 0"', 'axis xyz="1 0 0"')
+    urdf.write_text(text.replace('xyz="0.06 0 0"', f'xyz="0.06 {0.01 * sign} -0.06"'))
+    robot = robot_of(path)
+    v = robot.jacobian(robot.home)[:3, 0]
+    to = np.diff(robot.centers(robot.home), axis=0)[0]
+    assert sign * v @ to < 0.0
+    assert robot.closing[0, 0] == sign
+
+
+def test_slides_without_end_bound_how_fast_a_link_moves(tmp_path):
+    """No place of it moves faster than `reach` says, wherever up to 1 m the slide is."""
+    lift = 'name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"'
+    for ends in ("", 'range="0 inf"'):
+        xml = change(XML, lift, 'name="turn" axis="0 1 0" range="-1 1"')
+        slide = f'<joint name="out" type="slide" axis="1 0 0" {ends}/><joint name="proximal"'
+        xml = change(xml, '<joint name="proximal"', slide)
+        robot = written(tmp_path, xml[: xml.index("  <equality>")] + "</mujoco>")
+        assert np.isfinite(robot.reach).all()
+        speeds = np.linalg.norm(robot.jacobian(np.array([0.0, 1.0, 0.2, 0.1])), axis=0)
+        assert (speeds <= robot.reach[0] + EXACT).all()
 
 
 def test_two_files_are_joined_with_pose_and_prefix(tmp_path):
@@ -788,7 +865,7 @@ def test_a_ball_joint_is_refused_without_the_advice_to_lock_it(tmp_path):
 def test_a_urdf_is_not_probed_physically_and_the_way_out_is_said(tmp_path):
     """Coupled or not: it has neither sites to feel at nor servos."""
     path = claw(tmp_path)
-    nail = FINGER.format(n="nail", x=0, s=1, shape=BALL).replace('"base"', '"left"')
+    nail = FINGER.format(n="nail", x=0, s=1, shape=BALL, limit=LIMIT).replace('"base"', '"left"')
     nail = nail.replace("</joint>", '<mimic joint="left_joint" multiplier="0.5"/></joint>')
     (tmp_path / "claw.urdf").write_text(
         change((tmp_path / "claw.urdf").read_text(), "</robot>", nail + "</robot>")
@@ -918,6 +995,82 @@ def test_a_link_without_shape_is_refused_with_what_would_do(tmp_path):
     refused(lambda: written(tmp_path, toml=SHORT.replace("distal", "dista")), "mean 'distal'?")
 
 
+UNUSABLE = {  # limits of a URDF: what the message says of them
+    'lower="0.2" upper="-0.2"': ("[0.2, -0.2]", "= [-0.2, 0.2] }"),
+    'lower="0.2"': ("[0.2, 0]", "= [0, 0.2] }"),
+    'upper="-0.2"': ("[0, -0.2]", "= [-0.2, 0] }"),
+    'lower="0.1" upper="0.1"': ("[0.1, 0.1]", "= [LOW, HIGH] }"),
+    'lower="0" upper="0"': ("[0, 0]", "= [LOW, HIGH] }"),
+    'lower="0" upper="nan"': ("[0, nan]", "= [LOW, HIGH] }"),
+}
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("limit", UNUSABLE)
+def test_a_range_without_angles_is_refused_with_what_to_write(tmp_path, kind, limit):
+    def made(toml=""):
+        return claw(tmp_path, limit=limit, kind=kind, toml=toml)
+
+    refused(
+        lambda: robot_of(made()), "joint 'left_joint' of claw.urdf", *UNUSABLE[limit],
+        'lock = ["left_joint"]',
+    )  # fmt: skip
+    rest = "ranges = { right_joint = [0, 1], left_joint = [0, 0.5] }"
+    np.testing.assert_array_equal(robot_of(made(rest)).q_upper, [0.5, 1.0])
+
+
+def test_a_joint_that_is_locked_or_turns_without_end_needs_no_range(tmp_path):
+    limit = 'lower="0.2" upper="-0.2"'
+    robot = robot_of(claw(tmp_path, limit=limit, kind="continuous"))
+    np.testing.assert_array_equal(robot.q_upper, [np.inf, np.inf])
+    path = claw(tmp_path, limit=limit)
+    text = path.read_text().replace('[[contact_points]]\nlink = "right"\n', "")
+    path.write_text('ranges = { left_joint = [0, 1] }\nlock = ["right_joint"]\n' + text)
+    assert robot_of(path).joints == ("left_joint",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("", "", "[3, 0]"),
+        ('range="3 0"', 'range="300 0"', "[300, 0]"),
+        ('<compiler angle="radian"', '<compiler angle="degree"', "[0.0523599, 0]"),
+        ('range="3 0"', 'range="3 0" limited="true"', "[3, 0]"),
+        ('range="3 0"', 'range="3 3"', "[3, 3]"),
+    ],
+)
+def test_a_range_without_angles_is_refused_in_an_mjcf(tmp_path, old, new, told):
+    xml = change(XML, 'range="0 3"', 'range="3 0"').replace(old, new)
+    degrees = '"tiny.xml", degrees = true }' if "degree" in new else '"tiny.xml" }'
+    toml = SHORT.replace('"tiny.xml"', "{ file = " + degrees)
+    refused(lambda: written(tmp_path, xml, toml), "joint 'proximal' of tiny.xml", told)
+
+
+def test_a_range_of_the_default_class_counts_and_one_switched_off_does_not(tmp_path):
+    default = '<default><joint range="3 0"/></default><worldbody>'
+    xml = change(XML, 'axis="0 0 1" range="0 3"', 'axis="0 0 1"').replace("<worldbody>", default)
+    refused(lambda: written(tmp_path, xml), "joint 'proximal'", "[3, 0]")
+    off = change(XML, 'range="0 3"', 'range="3 0" limited="false"')
+    toml = "drop_couplings = true\n" + SHORT
+    assert written(tmp_path, off, toml).q_upper[1] == np.inf
+
+
+def test_a_range_of_a_joined_file_is_refused_by_its_full_name(tmp_path):
+    (tmp_path / "second.xml").write_text(change(XML, 'range="0 3"', 'range="3 0"'))
+    toml = (
+        '[[model]]\nfile = "tiny.xml"\n[[model]]\nfile = "second.xml"\nprefix = "b_"\n'
+        '[[contact_points]]\nlink = "b_distal"\n'
+    )
+    refused(lambda: written(tmp_path, toml=toml), "'b_proximal' of second.xml", '"b_proximal" =')
+    ranges = 'ranges = { "b_proximal" = [0, 1] }\n'
+    assert written(tmp_path, toml=ranges + toml).q_upper[-1] == 1.0
+
+
+def test_ranges_of_one_angle_are_refused_with_the_line_that_holds_a_joint(tmp_path):
+    toml = "ranges = { proximal = [0.1, 0.1] }\n" + SHORT
+    refused(lambda: written(tmp_path, toml=toml), "low < high", 'lock = ["proximal"]')
+
+
 def test_a_home_outside_its_range_is_refused(tmp_path):
     toml = "home = { proximal = 3.5 }\n" + SHORT
     refused(lambda: written(tmp_path, toml=toml), "home", "'proximal' at 3.5", "outside its range")
@@ -979,6 +1132,7 @@ REFUSALS = (
     lambda folder: written(folder, toml='lock = ["lft"]\n' + SHORT),
     lambda folder: written(folder, toml=SHORT.replace("distal", "dista")),
     lambda folder: written(folder, BARE, SHORT.replace("distal", "bare")),
+    lambda folder: robot_of(claw(folder, limit='lower="0.2" upper="-0.2"')),
     lambda folder: written(folder, toml="home = { proximal = 3.5 }\n" + SHORT),
     lambda folder: written(folder, toml=JOINED + 'link = "distal"\n'),
     lambda folder: written(folder, toml=SHORT.replace("tiny.xml", "no_such_package:hand.xml")),
