@@ -131,9 +131,31 @@ def test_jaws_close_towards_one_another_wherever_home_is(tmp_path, apart, limit)
     np.testing.assert_allclose(robot.closing, SLIDE_UNIT * np.eye(2), atol=EXACT)
 
 
-def test_hinges_closed_at_home_close_against_the_end_of_their_range(tmp_path):
-    robot = robot_of(claw(tmp_path, limit='lower="-1.5" upper="0"', apart=0.01))
+def test_jaws_beside_one_another_at_home_are_closed(tmp_path):
+    """As in some files the links' own origins are."""
+    path = claw(tmp_path, limit='lower="-0.05" upper="0"', kind="prismatic", apart=0.0)
+    urdf = tmp_path / "claw.urdf"
+    urdf.write_text(urdf.read_text().replace('xyz="0.0 0 0"', 'xyz="0 0.01 0"', 1))
+    robot = robot_of(path)
+    assert np.ptp(robot.centers(robot.home), axis=0).tolist() == [0.0, 0.01, 0.0]
+    np.testing.assert_allclose(robot.closing, SLIDE_UNIT * np.eye(2), atol=EXACT)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.01])
+def test_hinges_closed_at_home_close_against_the_end_of_their_range(tmp_path, apart):
+    robot = robot_of(claw(tmp_path, limit='lower="-1.5" upper="0"', apart=apart))
     np.testing.assert_array_equal(robot.closing, np.eye(2))
+
+
+def test_a_finger_closes_to_a_point_that_it_would_go_past(tmp_path):
+    """Half as high as the straight finger, on its narrower side; past it, 1 rad is further."""
+    path = claw(tmp_path, limit='lower="-1.5" upper="1"')
+    urdf = tmp_path / "claw.urdf"
+    urdf.write_text(urdf.read_text().replace('xyz="0.06 0 0"', 'xyz="-0.04 0 -0.05"'))
+    robot = robot_of(path)
+    gaps = [np.linalg.norm(np.diff(robot.centers(np.array([s, 0.0])), axis=0)) for s in (0, 0.5, 1)]
+    assert gaps[1] < gaps[0] < gaps[2]
+    assert robot.closing[0, 0] == 1.0
 
 
 @pytest.mark.parametrize("sign", [1, -1])
