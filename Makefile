@@ -117,6 +117,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,damping,benchmarks/damping.py --trials 100 --seed 53)
 	$(call keep,compositions,benchmarks/compositions.py --trials 20 --seed 31)
 	$(call keep,figure5,scenarios/cylinder_65.py --robot umass_torso --probe physical --preset loadcell --trials 20 --probes 25 --out $(RESULTS)/figure5)
+	$(call keep,forces,benchmarks/forces.py)
 	$(call keep,sensing,benchmarks/sensing.py --plot docs/images/sensing.png)
 	$(call keep,physics-figure5,benchmarks/physics.py figure5 --trials 20 --plot docs/images/figure5.png)
 	$(call keep,physics-closing,benchmarks/physics.py closing)

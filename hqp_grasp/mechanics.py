@@ -26,11 +26,16 @@ STEPS = 500  # Newton steps at most
 
 
 def tangents(normals: np.ndarray) -> np.ndarray:
-    """Two unit vectors (…, k, 2, 3) across each unit normal (…, k, 3), and each other."""
-    least = np.abs(normals).argmin(axis=-1)
-    first = np.cross(normals, np.eye(3)[least])
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
-    return np.stack([first, np.cross(normals, first)], axis=-2)
+    """Two unit vectors (…, k, 2, 3) across each unit normal (…, k, 3), and each other.
+
+    Duff et al., "Building an orthonormal basis, revisited", 2017: np.cross costs several times more.
+    """
+    x, y, z = np.moveaxis(normals, -1, 0)
+    s = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (s + z)
+    b = x * y * a
+    both = [1.0 + s * x * x * a, s * b, -s * x, b, s + y * y * a, -y]
+    return np.stack(both, axis=-1).reshape(*x.shape, 2, 3)
 
 
 def net_wrench(forces: np.ndarray, positions: np.ndarray, about: np.ndarray) -> np.ndarray:

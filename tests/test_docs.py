@@ -26,6 +26,7 @@ PYTHON_ON = [
     "CONTRIBUTING.md",
     "README.md",
     "any-robot.md",
+    "forces.md",
     "index.md",
     "looking.md",
     "many-trials.md",
