@@ -28,20 +28,26 @@ STEPS = 500  # Newton steps at most
 def tangents(normals: np.ndarray) -> np.ndarray:
     """Two unit vectors (…, k, 2, 3) across each unit normal (…, k, 3), and each other.
 
-    Duff et al., "Building an orthonormal basis, revisited", 2017: np.cross costs several times more.
+    The first is across the world's axis that the normal is farthest from: on upright walls it is
+    level, and the second upright, so that pyramids carry weights by an edge.
     """
-    x, y, z = np.moveaxis(normals, -1, 0)
-    s = np.where(z < 0.0, -1.0, 1.0)
-    a = -1.0 / (s + z)
-    b = x * y * a
-    both = [1.0 + s * x * x * a, s * b, -s * x, b, s + y * y * a, -y]
-    return np.stack(both, axis=-1).reshape(*x.shape, 2, 3)
+    least = np.abs(normals).argmin(axis=-1)
+    first = _cross(normals, np.eye(3)[least])
+    first /= np.sqrt((first * first).sum(axis=-1, keepdims=True))
+    return np.stack([first, _cross(normals, first)], axis=-2)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b along the last axis; np.cross costs several times as much on small arrays."""
+    x, y, z = np.moveaxis(a, -1, 0)
+    u, v, w = np.moveaxis(b, -1, 0)
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
 def net_wrench(forces: np.ndarray, positions: np.ndarray, about: np.ndarray) -> np.ndarray:
     """Σ f_i and Σ (x_i − c) × f_i, (…, 6) [N, N·m], of forces (…, k, 3), about c (…, 3) [m]."""
     lever = positions - about[..., None, :]
-    return np.concatenate([forces.sum(axis=-2), np.cross(lever, forces).sum(axis=-2)], axis=-1)
+    return np.concatenate([forces.sum(axis=-2), _cross(lever, forces).sum(axis=-2)], axis=-1)
 
 
 def grasp_map(positions: np.ndarray, about: np.ndarray) -> np.ndarray:
