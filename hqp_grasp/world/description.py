@@ -669,6 +669,8 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
     folder = path.parent
     model = data["model"]
     parts = model if isinstance(model, list) else [model]
+    if not parts:
+        raise InputError("model is empty")
     if "root" in data:
         if not isinstance(model, str):
             raise InputError("root belongs into [[model]], beside the file whose body it names")
@@ -683,10 +685,14 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
     if not hands:
         raise InputError("hands is empty")
     _refuse_twice("hands", [hand.name for hand in hands])
+    points = [point for hand in hands for point in hand.contact_points]
+    _refuse_twice("contact points with a ball", [p.name for p in points if p.ball is not None])
     files = tuple(_file(part, folder) for part in parts)
-    home, bases = data.get("home"), dict[str, tuple[float, ...]]()
-    if home is None or isinstance(home, str):
-        home, bases = _keyframe(folder, files, home)
+    named, bases = data.get("home"), dict[str, tuple[float, ...]]()
+    if named is None or isinstance(named, str):
+        home, bases = _keyframe(folder, files, named)
+    else:
+        home = {j: _number(f"home of {j}", v) for j, v in _table("home", data).items()}
     # Couplings that are said replace the file's, all or those that drop_couplings names.
     drop = data.get("drop_couplings", "couplings" in data)
     workspace = data.get("workspace")
@@ -694,14 +700,14 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         name=folder.resolve().name if path.name == "robot.toml" else path.stem,
         files=files,
         hands=hands,
-        home=_numbers("home", home),
+        home=home,
         bases=bases,
         speed=positive("speed", data["speed"]) if "speed" in data else None,
-        velocity={j: positive(f"velocity of {j}", v) for j, v in data.get("velocity", {}).items()},
+        velocity={j: positive(f"velocity of {j}", v) for j, v in _table("velocity", data).items()},
         lock=_texts(data.get("lock", [])),
         couplings=tuple(_coupling(c) for c in data.get("couplings", [])),
         drop_couplings=drop if isinstance(drop, bool) else _texts(drop),
-        ranges={j: _joint_range(j, v) for j, v in data.get("ranges", {}).items()},
+        ranges={j: _joint_range(j, v) for j, v in _table("ranges", data).items()},
         carriage=_flag("carriage", data.get("carriage", False)),
         workspace=None if workspace is None else _vector("workspace", workspace),
         clearance=_clearance(data.get("clearance", CLEARANCE)),
@@ -811,7 +817,9 @@ def _contact_point(data: object) -> ContactPoint:
         ball = (*centre, positive("ball.radius", ball["radius"]))
     flexion = data.get("flexion")
     if isinstance(flexion, dict):
-        closing: Mapping[str, float] | None = _numbers("flexion", flexion)
+        closing: Mapping[str, float] | None = {
+            joint: _number(f"flexion of {joint}", weight) for joint, weight in flexion.items()
+        }
     else:
         closing = None if flexion is None else dict.fromkeys(_texts(flexion), 1.0)
     geoms = (_text(data["geom"]),) if "geom" in data else _texts(data.get("geoms", []))
@@ -899,6 +907,13 @@ def _texts(value: object) -> tuple[str, ...]:
     return tuple(_text(v) for v in value)
 
 
+def _table(name: str, data: Mapping[str, Any]) -> Mapping[str, object]:
+    table = data.get(name, {})
+    if not isinstance(table, dict):
+        raise InputError(f"{name} must be a table of joints; got {table!r}")
+    return table
+
+
 def _flag(name: str, value: object) -> bool:
     if not isinstance(value, bool):
         raise InputError(f"{name} must be true or false; got {value!r}")
@@ -924,10 +939,6 @@ def _joint_range(joint: str, value: object) -> tuple[float, float]:
             f"home, home = {{ {joint} = {low:g} }} puts it there"
         )
     return low, high
-
-
-def _numbers(name: str, value: Mapping[str, object]) -> dict[str, float]:
-    return {key: _number(f"{name} of {key}", v) for key, v in value.items()}
 
 
 def _number(name: str, value: object) -> float:

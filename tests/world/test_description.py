@@ -669,10 +669,21 @@ def test_a_home_that_a_coupled_joint_cannot_follow_is_told(tmp_path):
     assert "home has" not in check(tiny_hand.write(tmp_path, XML, SHORT))
 
 
+@pytest.mark.parametrize("line", ["home = 5", "home = true", "velocity = 2", "ranges = [0, 1]"])
+def test_a_table_of_joints_must_be_one(tmp_path, line):
+    words = f"{line.split()[0]} must be a table of joints"
+    refused(lambda: written(tmp_path, toml=f"{line}\n{SHORT}"), words)
+    refused(lambda: written(tmp_path, toml=SHORT.replace('"tiny.xml"', "[]")), "model is empty")
+
+
 def test_two_hands_of_one_name_are_refused(tmp_path):
     hand = '[[hands]]\nname = "left"\ncontact_points = [{ link = "distal" }]\n'
     toml = 'model = "tiny.xml"\n' + hand + hand
     refused(lambda: written(tmp_path, NO_KEYS, toml), "two hands are named 'left'")
+    hand = hand.replace('"distal" }', '"distal", name = "tip", ball = { radius = 0.01 } }')
+    toml = 'model = "tiny.xml"\n' + hand + hand.replace("left", "right")
+    words = "two contact points with a ball are named 'tip'"
+    refused(lambda: written(tmp_path, NO_KEYS, toml), words)
 
 
 WELD = '<weld name="hold" body1="distal" body2="palm"/>'
