@@ -46,7 +46,7 @@ def measure(
             hg.Start((a, a), (e, e), max_draws=1).draw(scene, lambda _: probe, rng)
             found[i] = True
         except hg.ReachError as error:
-            why[str(error).partition("the last: ")[2].partition("); move")[0]] += 1
+            why.update(error.reasons)
         seconds.append(time.process_time() - begin)
     return drawn, found, seconds, why
 

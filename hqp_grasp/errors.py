@@ -2,6 +2,7 @@
 
 import math
 import operator
+from collections.abc import Mapping
 from numbers import Real
 
 import numpy as np
@@ -33,6 +34,10 @@ class WorkerError(HqpGraspError, RuntimeError):
 
 class ReachError(HqpGraspError, RuntimeError):
     """No starting posture touches the object: it is out of the hand's reach."""
+
+    def __init__(self, message: str, reasons: Mapping[str, int] | None = None) -> None:
+        super().__init__(message)
+        self.reasons = dict(reasons or {})  # why, and of how many drawn postures
 
 
 class TrialError(HqpGraspError, RuntimeError):

@@ -23,6 +23,26 @@ TURN = np.radians(15.0)  # [rad] and turns by this about its approach axis,
 BACK = 2  # having withdrawn by so many advances
 CLOSINGS = 16  # sampled postures of closing fingers
 MOST_COMMON = 3  # reasons why draws were rejected that are told
+# Draws that all fail alike, before the set-up counts as one that cannot work: were a tenth of all
+# draws to touch, this would come once in 200 trials (0.9^50 = 0.5 %).
+ALIKE = 50
+
+ARM = "the arm cannot reach the drawn posture"
+SPREAD = "the hand cannot spread as drawn"
+EDGE = "meets an edge or an end of the object"
+REMEDIES = {  # what helps where most draws fail for this
+    ARM: "move the object to where the arm can face it, or draw other elevations and offsets "
+    "(Start, or `start` in robot.toml)",
+    SPREAD: "draw from the spread joint's range (Start.adduction, or `start` in robot.toml)",
+    EDGE: "take a taller object, or one with upright sides",
+    Miss.NO_TOUCH: "the fingers close beside the object: take a larger one, or contact points that "
+    "close onto it",
+    Miss.INSIDE: "the open hand is narrower than the object: take a smaller one",
+    Miss.OTHER_LINK: "take a smaller or taller object, or draw other elevations (Start, or `start` "
+    "in robot.toml)",
+    Miss.OWN_LINK: "the fingers meet the hand before the object: take a larger one",
+    Miss.TABLE: "raise the object, or let it stand on something narrower",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +91,18 @@ class Start:
     ) -> FirstTouch:
         """Return the first touch that a draw finds; raise ReachError after `max_draws` without.
 
+        It is raised, too, once the first ALIKE draws have all failed for one kind of reason.
+
         `probe_in` gives the probe that touches in a scene.
         """
         robot = scene.articulated
         if self == Start() and robot.description.start:
             return replace(self, **robot.description.start).draw(scene, probe_in, rng)
         told: Counter[str] = Counter()
+        kinds: Counter[Miss | str] = Counter()
         for rejected in range(self.max_draws):
+            if rejected == ALIKE and len(kinds) == 1:
+                break
             adduction = rng.uniform(*self.adduction)
             elevation = rng.uniform(*self.elevation)
             offset = np.array([-abs(rng.uniform(*self.offset)), rng.uniform(*self.offset)])
@@ -85,19 +110,23 @@ class Start:
             heading = float(np.arctan2(-offset[1], -offset[0]))
             hand = _open_hand(robot, adduction)
             if hand is None:
-                told["the hand cannot spread as drawn"] += 1
+                told[SPREAD] += 1
+                kinds[SPREAD] += 1
                 continue
             reach = _reach(robot, hand[0]) + _extent(scene)
             distance = drawn - self.advance * np.ceil((drawn - reach) / self.advance)
             place = _Place(elevation, heading, distance)
             found = self._first_touch(scene, probe_in, *hand, place)
-            if not isinstance(found, str):
+            if not isinstance(found, _Rejected):
                 return FirstTouch(*found, rejected)
-            told[found] += 1
+            told[found.told] += 1
+            kinds[found.kind] += 1
         why = "; ".join(f"{count} {what}" for what, count in told.most_common(MOST_COMMON))
+        remedy = REMEDIES.get(kinds.most_common(1)[0][0], "move the object, or take another")
         raise ReachError(
             f"{robot.description.name} touches the object at {scene.position} from none of "
-            f"{self.max_draws} drawn postures ({why}); move the object, or take another"
+            f"{kinds.total()} drawn postures ({why}); {remedy}",
+            told,
         )
 
     def _first_touch(
@@ -107,34 +136,42 @@ class Start:
         q: np.ndarray,
         fixed: list[int],
         place: _Place,
-    ) -> tuple[Scene, Grasp] | str:
+    ) -> tuple[Scene, Grasp] | _Rejected:
         """Scene and grasp of the first touch that begins with the hand at `place`, or why none."""
-        told = ""
+        no = _Rejected(Miss.NO_TOUCH, "no fingertip gets ahead of the palm")
         for _ in range(MAX_PLACES):
             while True:
                 if place.distance <= 0.0:
-                    return told
+                    return no
                 reached = _placed(scene, q, fixed, place)
                 if reached is None:
-                    return "the arm cannot reach the drawn posture"
+                    return _Rejected(ARM, ARM)
                 placed, q = reached  # the next posture is near this one
                 felt = probe_in(placed).touch(q)
                 if isinstance(felt, Grasp):
                     break
-                told = f"{felt.reason.value} ({felt.where})"
+                no = _Rejected(felt.reason, f"{felt.reason.value} ({felt.where})")
                 if felt.reason is not Miss.NO_TOUCH:
-                    return told
+                    return no
                 place = replace(place, distance=place.distance - self.advance)
             if felt.other_links:
-                return f"{felt.other_links[0]} touches the object"
+                return _Rejected(Miss.OTHER_LINK, f"{felt.other_links[0]} touches the object")
             vertical = felt.normals[:, 2]
             worst = int(np.abs(vertical).argmax())
             if abs(vertical[worst]) <= scene.object.steepest:
                 return placed, felt
-            told = f"{felt.contacts[worst].name} meets an edge or an end of the object"
+            no = _Rejected(EDGE, f"{felt.contacts[worst].name} {EDGE}")
             back = place.distance + BACK * self.advance
             place = replace(_nearer_the_middle(placed, felt, worst, place), distance=back)
-        return told
+        return no
+
+
+@dataclass(frozen=True)
+class _Rejected:
+    """Why a draw is no start."""
+
+    kind: Miss | str  # what may have a remedy
+    told: str
 
 
 @dataclass(frozen=True)

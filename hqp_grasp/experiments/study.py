@@ -16,7 +16,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
-from hqp_grasp.errors import InputError, ResultsError, TrialError, WorkerError, flag, whole
+from hqp_grasp.errors import (
+    InputError,
+    ReachError,
+    ResultsError,
+    TrialError,
+    WorkerError,
+    flag,
+    whole,
+)
 from hqp_grasp.experiments.executor import DEATHS, address_of, run_all, tell
 from hqp_grasp.experiments.fingerprint import Fingerprint, cpu_kind, differences
 from hqp_grasp.experiments.parts import Parts
@@ -73,7 +81,8 @@ class Study:
     A trial that ends in an error keeps its rows so far, and says why in its column `error`; a rerun
     tries it again, and `trial.run((seed, i))` raises that error. One whose worker dies runs again,
     and has that for its error where it happens every time. With `strict` the study stops at the
-    first one: what is done is on disk, then TrialError is raised.
+    first one: what is done is on disk, then TrialError is raised. So does any study whose first
+    trial finds no start (ReachError), unless one has worked in this folder before.
     """
 
     trial: Repeatable
@@ -123,6 +132,7 @@ class Study:
         missing = [i for i in range(self.trials) if not parts.is_done(i)]
         bar = tqdm(total=self.trials, initial=self.trials - len(missing), unit="trial", ncols=80)
         work = _Work(self.trial, self.seed)
+        begins = len(missing) < self.trials or self.trials == 1  # else the first trial shows it
         with bar, closing(run_all(work, missing, self.jobs, self.cluster)) as running:
             try:
                 for i, table in running:
@@ -131,8 +141,12 @@ class Study:
                     parts.add(i, table)
                     bar.update()
                     error = table["error"][0].as_py()
+                    begins = begins or not (error or "").startswith(ReachError.__name__)
+                    told = f"trial {i} of seed {self.seed} ended by {error}"
                     if self.strict and error is not None:
-                        return TrialError(f"trial {i} of seed {self.seed} ended by {error}", i)
+                        return TrialError(told, i)
+                    if not begins:
+                        return TrialError(f"{told}; no other trial is run", i)
             except WorkerError as error:
                 raise WorkerError(
                     f"{error}; {len(parts)} trials are in {out}, and the same command continues"

@@ -125,8 +125,8 @@ class Trial:
         # in its record, with the rows so far.
         try:
             began = self._begin(entropy, probe)
-            rejected = began.rejected
-            for row, touch in self._probe(began, entropy, probe):
+            rejected = began.first.rejected
+            for row, touch in self._probe(began):
                 rows.append(row)
                 if touch is not None:
                     history.append(touch)
@@ -138,9 +138,9 @@ class Trial:
         record = Record(entropy, tuple(rows), grasps, rejected, robot.joints, ended)
         return record, failure
 
-    def _begin(self, entropy: tuple[int, ...], probe: Probe | None) -> FirstTouch:
+    def _begin(self, entropy: tuple[int, ...], probe: Probe | None) -> _Began:
         if isinstance(self.start, Grasp):
-            return FirstTouch(self.scene, self.start, 0)
+            return self._touching(FirstTouch(self.scene, self.start, 0), entropy, probe)
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
         if probe is None:
             return self._drawn(self.start, entropy, rng)
@@ -154,42 +154,40 @@ class Trial:
                 )
             return given
 
-        return self.start.draw(self.scene, same, rng)
+        return self._touching(self.start.draw(self.scene, same, rng), entropy, probe)
 
-    def _drawn(
-        self, start: Start, entropy: tuple[int, ...], rng: np.random.Generator
-    ) -> FirstTouch:
+    def _drawn(self, start: Start, entropy: tuple[int, ...], rng: np.random.Generator) -> _Began:
         """A start found by geometry; where a simulated hand cannot hold it, the next one."""
         rejected, last = 0, ""
         physics = self.physics
         if physics is not None and physics.imperfections.faults:  # they come later
             whole = replace(physics, imperfections=replace(physics.imperfections, faults=()))
-            return replace(self, probe=whole, preset=None)._drawn(start, entropy, rng)
+            first = replace(self, probe=whole, preset=None)._drawn(start, entropy, rng).first
+            return self._touching(first, entropy, None)
         for _ in range(MAX_UNHELD):
-            began = start.draw(self.scene, lambda scene: GeometricProbe(scene, self.links), rng)
-            rejected += began.rejected
-            hand, touching = self._hand(began, entropy, None)
-            felt = began.grasp if hand is None else touching.touch(began.grasp.q)
-            if isinstance(felt, Grasp):
-                return FirstTouch(began.scene, began.grasp, rejected)
-            last, rejected = f"{felt.reason.value} ({felt.where})", rejected + 1
+            first = start.draw(self.scene, lambda scene: GeometricProbe(scene, self.links), rng)
+            rejected += first.rejected
+            began = self._touching(replace(first, rejected=rejected), entropy, None)
+            if began.hand is None or isinstance(began.felt, Grasp):
+                return began
+            last, rejected = f"{began.felt.reason.value} ({began.felt.where})", rejected + 1
         raise ReachError(
             f"the simulated hand holds none of {MAX_UNHELD} postures that geometry finds "
             f"(the last: {last})"
         )
 
-    def _probe(
-        self, began: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
-    ) -> Iterator[tuple[dict[str, object], Touch | None]]:
-        """The row of every touch as it is made; the last, without a touch, tells of giving up."""
-        robot = began.scene.articulated
-        controller = self.controller(began.scene)
-        stack = Stack.of(self.stack)
-        hand, touching = self._hand(began, entropy, probe)
-        felt: Grasp | Missed = began.grasp
+    def _touching(self, first: FirstTouch, entropy: tuple[int, ...], probe: Probe | None) -> _Began:
+        hand, touching = self._hand(first, entropy, probe)
+        felt: Grasp | Missed = first.grasp
         if isinstance(touching, PhysicalProbe | NoisyProbe):
-            felt = touching.touch(began.grasp.q)
-        history = [Touch(began.grasp.q, felt)]
+            felt = touching.touch(first.grasp.q)
+        return _Began(first, hand, touching, felt)
+
+    def _probe(self, began: _Began) -> Iterator[tuple[dict[str, object], Touch | None]]:
+        """The row of every touch as it is made; the last, without a touch, tells of giving up."""
+        scene, hand, touching = began.first.scene, began.hand, began.touching
+        robot, controller, stack = scene.articulated, self.controller(scene), Stack.of(self.stack)
+        history = [Touch(began.first.grasp.q, began.felt)]
         yield self._row(robot, stack, history[0], None, hand, touching), history[0]
         while len(history) <= self.probes:
             step = controller.step(history)
@@ -202,16 +200,16 @@ class Trial:
             yield row | _about(step) | _in_transit(touching, history, step), history[-1]
 
     def _hand(
-        self, began: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
+        self, first: FirstTouch, entropy: tuple[int, ...], probe: Probe | None
     ) -> tuple[SimulatedHand | None, Probe]:
         """The simulated hand, if any, and the probe that touches."""
-        physics, robot = self.physics, began.scene.articulated
+        physics, robot = self.physics, first.scene.articulated
         rng = np.random.default_rng(np.random.SeedSequence([*entropy, IMPERFECTIONS]))
         if probe is not None or physics is None:
-            probe = probe or GeometricProbe(began.scene, self.links)
+            probe = probe or GeometricProbe(first.scene, self.links)
             return None, probe if self.noise is None else NoisyProbe(probe, robot, self.noise, rng)
-        hand = SimulatedHand(began.scene, physics, self.links, rng)
-        hand.place(began.grasp.q)
+        hand = SimulatedHand(first.scene, physics, self.links, rng)
+        hand.place(first.grasp.q)
         return hand, PhysicalProbe(hand, robot, PRESS, hand.table)
 
     def _empty(
@@ -246,6 +244,16 @@ class Trial:
             row |= true_errors(true if isinstance(true, Grasp) else None)
         row["limit_violation"] = worst
         return row
+
+
+@dataclass(frozen=True, eq=False)
+class _Began:
+    """A trial after its first touch."""
+
+    first: FirstTouch
+    hand: SimulatedHand | None  # of a physical probe
+    touching: Probe
+    felt: Grasp | Missed  # by that probe
 
 
 def _in_transit(probe: Probe, history: Sequence[Touch], step: Step) -> dict[str, object]:

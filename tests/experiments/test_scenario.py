@@ -459,19 +459,36 @@ def test_strict_stops_at_the_first_failing_trial_and_says_how_to_replay_it(faili
 
 
 def test_where_every_trial_fails_that_is_said_and_the_status_is_not_zero(monkeypatch, tmp_path):
-    def out_of_reach(*_):
-        raise ReachError("the object is out of reach")
+    def broken(*_):
+        raise SolverError("no answer")
 
-    monkeypatch.setattr(start.Start, "draw", out_of_reach)
+    monkeypatch.setattr(start.Start, "draw", broken)
     message = (
-        r"^cylinder: every trial ended in an error, trial 0 by ReachError: the object is out of "
-        r"reach; replay it:\n"
+        r"^cylinder: every trial ended in an error, trial 0 by SolverError: no answer; "
+        r"replay it:\n"
     )
     with pytest.raises(SystemExit, match=message) as exit_:
         call(*TINY, "--out", tmp_path)
     errors = pq.read_table(tmp_path / "probes.parquet").column("error")
     assert errors.null_count == 0
     assert not (tmp_path / "convergence.png").exists()
+    with pytest.raises(SolverError):
+        replayed(exit_.value.code)
+
+
+def test_where_no_start_is_found_that_is_said_after_the_first_trial(monkeypatch, tmp_path):
+    def out_of_reach(*_):
+        raise ReachError("the object is out of reach; move it")
+
+    monkeypatch.setattr(start.Start, "draw", out_of_reach)
+    message = (
+        r"^cylinder: trial 0 of seed 2 ended by ReachError: the object is out of reach; move it; "
+        r"no other trial is run; replay it:\n"
+    )
+    with pytest.raises(SystemExit, match=message) as exit_:
+        call(*TINY, "--out", tmp_path)
+    rows = pq.read_table(tmp_path / "probes.parquet")
+    assert rows.num_rows == PROBES + 1 and rows["error"].null_count == 0
     with pytest.raises(ReachError):
         replayed(exit_.value.code)
 

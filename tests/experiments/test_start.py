@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import tiny_hand
 from starts import AWKWARD, begin
 
 from hqp_grasp.errors import InputError, ReachError
-from hqp_grasp.experiments.start import MAX_PLACES, SHIFT, TURN, Start
+from hqp_grasp.experiments.start import ALIKE, MAX_PLACES, SHIFT, TURN, Start
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.hierarchy.hqp import HQP
@@ -258,6 +259,64 @@ def test_the_last_reason_is_told(scene):
     told = Told(then=Missed(Miss.INSIDE, "finger_2"))
     with pytest.raises(ReachError, match=r"began inside the object \(finger_2\)"):
         first_touch(scene, told, np.random.default_rng(0), Start(max_draws=3))
+
+
+MISSES = [
+    (Miss.NO_TOUCH, "take a larger one"),
+    (Miss.INSIDE, "take a smaller one"),
+    (Miss.OTHER_LINK, "take a smaller or taller object"),
+    (Miss.OWN_LINK, "take a larger one"),
+    (Miss.TABLE, "raise the object"),
+    (Miss.STUCK, "move the object, or take another"),
+]
+
+
+@pytest.mark.parametrize(("reason", "remedy"), MISSES)
+def test_a_set_up_that_cannot_work_says_so_early_with_the_remedy_that_fits(reason, remedy):
+    """All draws fail for one kind of reason, whichever finger it is: 500 of them took minutes."""
+
+    class Told:
+        touches = 0
+
+        def touch(self, q_target):
+            self.touches += 1
+            return Missed(reason, f"finger_{1 + self.touches % 3}")
+
+    message = f"none of {ALIKE} drawn postures .*{reason.value} .*; .*{remedy}"
+    with pytest.raises(ReachError, match=message) as told:
+        first_touch(Scene("bhand"), Told(), np.random.default_rng(0), Start(advance=0.1))
+    assert sum(told.value.reasons.values()) == ALIKE
+    assert all(reason.value in why for why in told.value.reasons)
+
+
+def test_draws_that_fail_for_several_reasons_go_on_to_the_last():
+    class Told:
+        touches = 0
+
+        def touch(self, q_target):
+            self.touches += 1
+            return Missed((Miss.INSIDE, Miss.OWN_LINK)[self.touches == 7], "finger_1")
+
+    start = Start(max_draws=ALIKE + 20)
+    with pytest.raises(ReachError, match=f"none of {ALIKE + 20} .*take a smaller one") as told:
+        first_touch(Scene("bhand"), Told(), np.random.default_rng(0), start)
+    assert sorted(told.value.reasons.values()) == [1, ALIKE + 19]
+
+
+def test_a_start_after_many_draws_that_failed_alike_is_still_found(starts):
+    scene, inside = Scene("bhand"), Missed(Miss.INSIDE, "finger_1")
+    told = Told(*[inside] * (ALIKE - 1), then=starts[0].grasp)
+    assert first_touch(scene, told, np.random.default_rng(0)).rejected == ALIKE - 1
+
+
+def test_an_object_out_of_reach_is_said_after_few_draws():
+    with pytest.raises(ReachError, match=f"none of {ALIKE} drawn .*{ALIKE} the arm cannot reach"):
+        Trial(Scene(position=(3.0, 0.0, 0.2)), ForceTask()).run(0)
+
+
+def test_why_no_start_was_found_survives_the_way_between_processes():
+    error = pickle.loads(pickle.dumps(ReachError("none of 2", {"the arm cannot": 2})))
+    assert (str(error), error.reasons) == ("none of 2", {"the arm cannot": 2})
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -11,7 +11,14 @@ import pytest
 from own_law import ManyThreadsTask, OneThreadTask
 
 from hqp_grasp.control.controller import Controller
-from hqp_grasp.errors import InputError, ResultsError, SolverError, TrialError, WorkerError
+from hqp_grasp.errors import (
+    InputError,
+    ReachError,
+    ResultsError,
+    SolverError,
+    TrialError,
+    WorkerError,
+)
 from hqp_grasp.experiments import executor, fingerprint, parts
 from hqp_grasp.experiments import study as module
 from hqp_grasp.experiments.record import COLUMNS, empty_row
@@ -327,6 +334,49 @@ def test_every_worker_has_one_blas_thread(trial, tmp_path, monkeypatch):
     table = Study(one, 2, SEED, jobs=2).run(tmp_path / "results")
     assert table.column("error").null_count == table.num_rows
     assert not any(name in os.environ for name in executor.THREADS)
+
+
+@pytest.fixture
+def starting(monkeypatch):
+    """Trials of which these find no start, from here on."""
+    numbers, begin = set(), Trial._begin
+
+    def beginning(self, entropy, probe):
+        if entropy[-1] in numbers:
+            raise ReachError("out of reach; move the object")
+        return begin(self, entropy, probe)
+
+    monkeypatch.setattr(Trial, "_begin", beginning)
+    return numbers
+
+
+def test_a_study_whose_first_trial_finds_no_start_runs_no_other(
+    study, tmp_path, starting, ran, done
+):
+    starting.update(range(TRIALS))
+    out = tmp_path / "results"
+    message = "trial 0 of .* ended by ReachError: out of reach; move the object; no other trial"
+    for _ in range(2):  # nor when it is asked again
+        with pytest.raises(TrialError, match=message):
+            study.run(out)
+    assert ran == [0, 0]
+    assert pq.read_table(out / "probes.parquet").num_rows == PROBES + 1
+    starting.clear()
+    assert same(study.run(out), done[1])
+
+
+def test_a_study_goes_on_where_a_trial_has_found_a_start(study, tmp_path, starting, ran):
+    starting.update(range(1, TRIALS))
+    table = study.run(tmp_path / "results")
+    assert ran == list(range(TRIALS)) and table.num_rows == TRIALS * (PROBES + 1)
+    assert study.run(tmp_path / "results").num_rows == TRIALS * (PROBES + 1)
+
+
+def test_a_start_found_counts_though_its_trial_failed(study, tmp_path, starting, failing, ran):
+    failing.add(0)
+    starting.add(1)
+    study.run(tmp_path / "results")
+    assert ran == list(range(TRIALS))
 
 
 def test_a_trial_whose_process_always_dies_is_a_failing_trial(done, study, tmp_path, monkeypatch):

@@ -19,6 +19,8 @@ from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, stack_of
 from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.touch.physical import PhysicalProbe
+from hqp_grasp.touch.simulated import SimulatedHand
 from hqp_grasp.world.scene import Prism, Scene
 
 SEEDS = (0, 1, 2)
@@ -517,3 +519,28 @@ def test_what_the_papers_form_leaves_of_the_moment_is_in_proportion_to_its_dampi
         record = Trial(Scene(), stack_of("fmk"), probes=25, form=form).run(SEEDS[0])
         left.append(np.sqrt(record.rows[-1]["eps_m"]))
     assert left[0] == pytest.approx(10.0 * left[1], rel=0.05)
+
+
+# ---------------------------------------------------------------- how often a hand is built
+
+
+@pytest.mark.parametrize(("preset", "hands"), [(None, 1), ("loadcell", 1)])
+def test_a_physical_trial_builds_its_hand_once_and_touches_first_once(
+    scene, stack, monkeypatch, preset, hands
+):
+    built, touched = [], []
+    build, touch = SimulatedHand.__init__, PhysicalProbe.touch
+
+    def building(self, *arguments, **settings):
+        built.append(self)
+        build(self, *arguments, **settings)
+
+    def touching(self, *arguments, **settings):
+        touched.append(self)
+        return touch(self, *arguments, **settings)
+
+    monkeypatch.setattr(SimulatedHand, "__init__", building)
+    monkeypatch.setattr(PhysicalProbe, "touch", touching)
+    record = Trial(scene, stack, probes=1, probe="physical", preset=preset).run(0)
+    assert record.rejected == 0
+    assert len(built) == hands and len(touched) == 2
