@@ -10,7 +10,7 @@ import numpy as np
 
 from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.description import CARRIAGE, RobotDescription
-from hqp_grasp.world.robot import CAPSULE, SPHERE, Robot, compiled, described
+from hqp_grasp.world.robot import CAPSULE, CENTRED, SPHERE, Robot, compiled, described
 from hqp_grasp.world.second_opinion import second_opinion
 
 CLOSINGS = np.linspace(0.0, 1.0, 21)  # shares by which fingers are closed
@@ -159,6 +159,9 @@ def _contact_points(robot: Robot) -> list[str]:
         others = np.delete(x, i, axis=0)
         if len(others) and robot.closing[i].any():
             towards = others.mean(axis=0) - x[i]
+            if np.linalg.norm(towards) < CENTRED:
+                lines.append("    at home it is amid the others, and moves towards none")
+                continue
             speed = float(J[i] @ robot.closing[i] @ towards / np.linalg.norm(towards))
             way = "towards" if speed > 0.0 else "AWAY FROM"
             lines.append(f"    at home it moves {way} the others at {1e3 * speed:+.0f} mm/rad")

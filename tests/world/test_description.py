@@ -141,6 +141,11 @@ def test_jaws_beside_one_another_at_home_are_closed(tmp_path):
     np.testing.assert_allclose(robot.closing, SLIDE_UNIT * np.eye(2), atol=EXACT)
 
 
+def test_the_check_of_jaws_at_one_place_names_no_direction(tmp_path):
+    text = check(claw(tmp_path, limit='lower="-0.05" upper="0"', kind="prismatic", apart=0.0))
+    assert text.count("at home it is amid the others") == 2 and "nan" not in text
+
+
 @pytest.mark.parametrize("apart", [0.0, 0.01])
 def test_hinges_closed_at_home_close_against_the_end_of_their_range(tmp_path, apart):
     robot = robot_of(claw(tmp_path, limit='lower="-1.5" upper="0"', apart=apart))
