@@ -222,6 +222,22 @@ def test_meshes_of_one_name_in_two_folders_are_two(tmp_path):
         assert abs(half_edge(object_mjcf(tmp_path, "m.stl", folder)) - half) < TOL
 
 
+def test_links_whose_meshes_have_one_name_in_two_folders_keep_their_own(tmp_path):
+    second = URDF[URDF.index('<link name="finger">') :].replace("finger", "thumb")
+    second = second.replace('"bend"', '"oppose"')
+    urdf = URDF.format(file="a/m.stl").removesuffix("</robot>") + second.format(file="b/m.stl")
+    (tmp_path / "one.urdf").write_text(urdf)
+    points = [POINT.format(link=link).replace('"finger"\nlink', f'"{link}"\nlink')
+              for link in ("finger", "thumb")]  # fmt: skip
+    (tmp_path / "robot.toml").write_text('model = "one.urdf"\n' + "".join(points))
+    for folder, half in (("a", SMALL), ("b", LARGE)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "m.stl").write_bytes(stl(half))
+        os.utime(tmp_path / folder / "m.stl", (1e9, 1e9))
+    half = robot(tmp_path).geom_aabb[:, 3]
+    np.testing.assert_allclose(half, [SMALL, LARGE], atol=TOL)
+
+
 def test_a_texture_written_again_with_the_same_time_stamp_is_read_again(tmp_path):
     """A robot's look is part of its model, and so of its fingerprint."""
     xml = tiny_hand.XML.replace(
