@@ -69,9 +69,7 @@ class Fingerprint:
         if isinstance(value, np.ndarray) and value.dtype != object:
             return f"{value.dtype}{list(value.shape)} {_sha(value.tobytes())}"
         if isinstance(value, mujoco.MjModel):
-            buffer = np.empty(mujoco.mj_sizeModel(value), np.uint8)
-            mujoco.mj_saveModel(value, None, buffer)
-            return f"model {_sha(buffer.tobytes())}"
+            return f"model {_sha(_model_bytes(value))}"
         if isinstance(value, type | FunctionType | BuiltinFunctionType):
             self._note_source(value, at)
             return f"{value.__module__}.{value.__qualname__}"
@@ -179,6 +177,19 @@ def _found_by_name(thing: type | FunctionType | BuiltinFunctionType) -> bool:
     for name in thing.__qualname__.split("."):
         found = getattr(found, name, None)
     return found is thing
+
+
+def _model_bytes(model: mujoco.MjModel) -> bytes:
+    """All numbers and names of a model, but not the paths of the files that it was read from."""
+    parts = [bytes(model.names)]
+    for held in (model, model.opt, model.stat):
+        for name in dir(held):
+            value = getattr(held, name) if not name.startswith("_") else None
+            numbers = isinstance(value, np.ndarray | int | float)
+            if numbers and "path" not in name and name != "nbuffer":
+                array = np.asarray(value)
+                parts.append(f"{name} {array.dtype}{array.shape}".encode() + array.tobytes())
+    return b"\n".join(parts)
 
 
 def _sha(data: bytes) -> str:

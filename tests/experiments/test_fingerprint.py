@@ -1,5 +1,6 @@
 """Two configurations are told apart by all that decides, and by nothing else."""
 
+import copy
 import dataclasses
 import functools
 import importlib
@@ -129,6 +130,21 @@ def test_a_robot_counts_by_its_compiled_model_and_not_by_where_it_stands(tmp_pat
     assert told_apart(Scene(here), Scene(there)) == [
         "trial.robot.velocity.proximal is 2.0 there, 2.5 here"
     ]
+
+
+@pytest.mark.parametrize("name", ["geom_size", "jnt_range", "qpos0", "eq_data", "body_mass"])
+def test_any_number_of_a_model_counts(scene, name):
+    one, other = copy.copy(scene.model), copy.copy(scene.model)
+    assert told_apart(one, other) == []
+    getattr(other, name).flat[-1] += 1e-9
+    assert told_apart(one, other) == ["trial differs"]
+
+
+@pytest.mark.parametrize("name", ["timestep", "ccd_tolerance", "gravity"])
+def test_any_option_of_a_model_counts(scene, name):
+    one, other = copy.copy(scene.model), copy.copy(scene.model)
+    setattr(other.opt, name, getattr(one.opt, name) + 1e-9)
+    assert told_apart(one, other) == ["trial differs"]
 
 
 def test_attributes_that_are_no_fields_count_too():

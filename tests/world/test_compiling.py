@@ -238,6 +238,15 @@ def test_links_whose_meshes_have_one_name_in_two_folders_keep_their_own(tmp_path
     np.testing.assert_allclose(half, [SMALL, LARGE], atol=TOL)
 
 
+def test_the_same_meshes_elsewhere_are_the_same_robot(tmp_path):
+    prints = []
+    for folder, half in (("a", SMALL), ("longer", SMALL), ("c", LARGE)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "m.stl").write_bytes(stl(half))
+        prints.append(Fingerprint(robot_urdf(tmp_path / folder, "m.stl")).parts["trial"])
+    assert prints[0] == prints[1] != prints[2]
+
+
 def test_a_texture_written_again_with_the_same_time_stamp_is_read_again(tmp_path):
     """A robot's look is part of its model, and so of its fingerprint."""
     xml = tiny_hand.XML.replace(
