@@ -5,11 +5,11 @@
 Every ordering of every subset of force, moment and kinematic law, and their direct superposition on
 one level (f+m+k, which the paper argues against), each in up to three forms. "memoryless" composes
 in joint space, by the last grasp alone. "paper" composes in contact space (eq. 11–13), where that
-is defined: the kinematic law last. "hierarchy", the default, is another rule than "memoryless" only
-where force and moment both are there. The kinematic law asks for a step of every joint, so what
-stands below it is never felt: fkm is fk, mkf is mk, and all that begin with k are k. "Good" and the
-kinds of failure are those of `python -m hqp_grasp report`; the last column is the difference to
-memoryless f ▷ m ▷ k, in pairs of the same start.
+is defined: the kinematic law last. "hierarchy", the default, plans otherwise than "memoryless" only
+where force and moment both are there; with fewer laws all it adds is to settle. The kinematic law
+asks for a step of every joint, so what stands below it is never felt: fkm is fk, mkf is mk, and all
+that begin with k are k. "Good" and the kinds of failure are those of `python -m hqp_grasp report`;
+the last column is the difference to memoryless f ▷ m ▷ k, in pairs of the same start.
 """
 
 from __future__ import annotations
