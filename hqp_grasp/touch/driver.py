@@ -184,7 +184,8 @@ class Driver(Protocol):
         they press with now, by PRESS_RATE at most, those with 0 too: they yield. So the tips push
         the object with wrenches w_i, of which torque = Σ J_iᵀ w_i. Goes on until `move`, `close` or
         `stop`, or until the hand stops by itself: for the watchdog, a tip's force near
-        `limits.grip`, or a joint that meets nothing which resists. Then nothing is pressed.
+        `limits.grip`, or a joint that meets nothing which resists. Then no torque is followed: what
+        is held may fall.
         Raises InputError, and changes nothing, for a torque beyond `limits.torque`.
         """
         ...

@@ -10,7 +10,7 @@ import numpy as np
 
 from hqp_grasp.errors import HqpGraspError, InputError
 from hqp_grasp.grasp import as_array
-from hqp_grasp.touch.driver import Driver, Readings
+from hqp_grasp.touch.driver import PRESS_RATE, Driver, Readings
 from hqp_grasp.touch.physical import payload, weight
 from hqp_grasp.touch.sensing import sense
 from hqp_grasp.world.robot import Robot
@@ -27,6 +27,17 @@ PRESS_TOLERANCE = 0.15
 CLOSING = 0.3  # [rad/s]
 PLAIN, TORQUE_NEGATED = np.ones(6), np.repeat([1.0, -1.0], 3)
 TELLING = np.radians(5.0)  # by which normals fit better, on average
+TORQUE_TOLERANCE = 0.3  # share of the largest torque
+FIRM, LIGHT = 0.3, 0.3  # shares: of the grip limit, and of a firm press
+HALF = 0.5  # share of a torque limit that a firm press needs, at most
+FOLLOWS = 0.6  # [s] in which what is pressed is followed
+FOLLOWED = 0.5  # share of what was asked for, at least
+IGNORED = 0.2  # share of it that says nothing
+ENDED = 0.5  # share of what was pressed that is left, at most
+WINDOW = 0.05  # [s]
+WINDOW_TOLERANCE = 0.15  # share of the torque
+CARRIED = 2e-3  # [m] of the tips
+NOTHING = 3.0  # [s] for a finger to notice that it presses on nothing
 PATIENCE = 8.0  # [s] for fingers to touch
 NORMAL_TOLERANCE = np.radians(20.0)  # measured normals are given to 10°
 WEIGHT_TOLERANCE = 0.5  # share of the tip's weight
@@ -89,6 +100,9 @@ def check_driver(rig: Rig) -> None:
             check(rig)
         except DriverError as fault:
             faults.append(str(fault))
+        except InputError as refusal:
+            about = check.__name__.replace("_", " ")
+            faults.append(f"refused is what may be asked for ({about}): {refusal}")
         finally:
             rig.driver.stop()
     if faults:
@@ -241,23 +255,9 @@ def tips_weigh_what_they_weigh(rig: Rig) -> None:
 
 def closing_ends_at_a_touch(rig: Rig) -> None:
     """Every finger finds the thing, and feels it push the way it lies."""
-    rig.go(rig.open)
-    rig.wait(0.3)
-    before = rig.wait(0.3)
-    for i in range(len(rig.normals)):
-        rig.driver.close(i, CLOSING, TOUCH)
-    closed = _until_touched(rig)
-    if not closed.touched.all():
-        names = [n for n, t in zip(rig._names, closed.touched, strict=True) if not t]
-        raise DriverError(f"close does not end at a touch: {', '.join(names)} did not")
-    rig.driver.hold(PRESS)
-    rig.wait(1.0)
-    held = rig.wait(0.3)
-    q = held.q.mean(axis=0)
-    load, R_world_tip = payload(rig.robot), rig.robot.tip_frames(q).copy()
-    pushed = held.wrench.mean(axis=0) - before.wrench.mean(axis=0)
-    pushed -= weight(load, R_world_tip)
-    pushed += weight(load, rig.robot.tip_frames(before.q.mean(axis=0)))
+    before, held = _held(rig)
+    R_world_tip = rig.robot.tip_frames(held.q.mean(axis=0)).copy()
+    pushed = _pushed(rig, before, held)
     better = []
     for i, (name, R) in enumerate(zip(rig._names, R_world_tip, strict=True)):
         f = R @ pushed[i, :3]
@@ -290,6 +290,30 @@ def _off(rig: Rig, i: int, R: np.ndarray, pushed: np.ndarray) -> float:
     except InputError:  # no push on the tip explains the wrench
         return np.pi
     return float(np.arccos(np.clip(normal @ rig.normals[i], -1.0, 1.0)))
+
+
+def _held(rig: Rig) -> tuple[Readings, Readings]:
+    """Readings of open fingers, and of when all of them hold PRESS."""
+    rig.go(rig.open)
+    rig.wait(0.3)
+    before = rig.wait(0.3)
+    for i in range(len(rig.normals)):
+        rig.driver.close(i, CLOSING, TOUCH)
+    closed = _until_touched(rig)
+    if not closed.touched.all():
+        names = [n for n, t in zip(rig._names, closed.touched, strict=True) if not t]
+        raise DriverError(f"close does not end at a touch: {', '.join(names)} did not")
+    rig.driver.hold(PRESS)
+    rig.wait(1.0)
+    return before, rig.wait(0.3)
+
+
+def _pushed(rig: Rig, before: Readings, now: Readings) -> np.ndarray:
+    """The mean wrench (k, 6) beside the tips' own weight, each in its tip's frame."""
+    load, robot = payload(rig.robot), rig.robot
+    pushed = now.wrench.mean(axis=0) - before.wrench.mean(axis=0)
+    pushed -= weight(load, robot.tip_frames(now.q.mean(axis=0)))
+    return np.asarray(pushed + weight(load, robot.tip_frames(before.q.mean(axis=0))))
 
 
 def contact_forces_are_kept(rig: Rig) -> None:
@@ -326,6 +350,222 @@ def _must_stay_below(what: str, seen: Sequence[Readings], limit: float) -> None:
         raise DriverError(f"limits not held: {what} {largest:.3g} N, the limit is {limit:.3g} N")
 
 
+def torques_are_those_that_fingers_hold_with(rig: Rig) -> None:
+    """The motors' torques are in balance with what the tips feel."""
+    before, held = _held(rig)
+    q = held.q.mean(axis=0)
+    felt = _pushed(rig, before, held)
+    frames, places = rig.robot.tip_frames(q).copy(), _places(rig, q)
+    due = np.zeros(rig.robot.n)
+    for i, R in enumerate(frames):
+        due -= rig.robot.link_jacobian(q, i, places[i]).T @ (R @ felt[i, :3])
+    _must_read(rig, "holding", due, held.torque.mean(axis=0))
+
+
+def _must_read(rig: Rig, what: str, due: np.ndarray, read: np.ndarray) -> None:
+    """Raise where fingers' joints do not read the torque (n,) [N·m] that is due."""
+    fingers = _fingers(rig)
+    size = np.abs(due[fingers]).max()
+    off = np.where(np.isnan(read), np.inf, np.abs(read - due))[fingers]
+    if off.max() > TORQUE_TOLERANCE * size:
+        j = fingers[int(off.argmax())]
+        raise DriverError(
+            f"readings of torque are wrong: {what}, {rig.joint(j)} presses with {due[j]:.3g} N·m "
+            f"and reads {read[j]:.3g}"
+        )
+
+
+def _fingers(rig: Rig) -> list[int]:
+    """Joints that carry no palm, into q."""
+    robot = rig.robot
+    return [j for j in range(robot.n) if j not in robot.arm and not robot.idle[j]]
+
+
+def _places(rig: Rig, q: np.ndarray) -> np.ndarray:
+    """Where the tips meet the thing (k, 3) [m], world."""
+    return np.asarray(rig.robot.centers(q) - rig.robot.tip_radius[:, None] * rig.normals)
+
+
+def _torque(rig: Rig, q: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    """Joint torques (n,) [N·m] by which tips push the thing with `forces` (k,) [N], inwards."""
+    torque, fingers = np.zeros(rig.robot.n), _fingers(rig)
+    for i, place in enumerate(_places(rig, q)):
+        J = rig.robot.link_jacobian(q, i, place)
+        torque[fingers] -= forces[i] * (rig.normals[i] @ J)[fingers]
+    return torque
+
+
+def _pressed(rig: Rig, firmly: bool) -> tuple[Readings, tuple[float, float], Readings]:
+    """Readings of open fingers, what is a light and a firm press [N], and readings under one."""
+    limits = rig.driver.limits
+    if limits.grip == 0.0:
+        raise DriverError("the driver cannot press: its DriverLimits.grip is 0 N")
+    before, held = _held(rig)
+    q, k = held.q.mean(axis=0), len(rig.normals)
+    alone = np.array([_torque(rig, q, one) for one in np.eye(k)])  # by 1 N
+    firm = min(FIRM * limits.grip, HALF / float((np.abs(alone) / limits.torque).max()))
+    force = firm if firmly else LIGHT * firm
+    rig.driver.press(force * alone.sum(axis=0))
+    rig.wait(FOLLOWS)
+    pressed = rig.wait(0.3)
+    got = _inwards(rig, before, pressed)
+    said = f"each tip held {PRESS:g} N, was told to press with {force:.2g} N, and presses with"
+    if (got < FOLLOWED * min(PRESS, force)).any():
+        raise DriverError(f"press has the wrong sign: {said} {np.round(got, 2)} N")
+    if pressed.fault:
+        raise DriverError(f"press: {force:.2g} N at each tip stopped the hand: {pressed.fault}")
+    return before, (LIGHT * firm, firm), pressed
+
+
+def _inwards(rig: Rig, before: Readings, now: Readings) -> np.ndarray:
+    """Force (k,) [N] of each tip on the thing, along its normal."""
+    frames = rig.robot.tip_frames(now.q.mean(axis=0)).copy()
+    pushed = _pushed(rig, before, now)[:, :3]
+    return np.asarray(np.einsum("kab,kb,ka->k", frames, pushed, rig.normals))
+
+
+def pressing_is_followed_slowly(rig: Rig) -> None:
+    """Each finger presses as its torque says, alone, from what it was to what is asked."""
+    before, (light, firm), now = _pressed(rig, firmly=False)
+    q, k = now.q.mean(axis=0), len(rig.normals)
+    was, arm = _inwards(rig, before, now), now.q[-1]
+    more = firm - light
+    for i, name in enumerate(rig._names):
+        torque = _torque(rig, q, np.where(np.arange(k) == i, firm, light))
+        rig.driver.press(torque)
+        rising = rig.wait(FOLLOWS)
+        pressed = rig.wait(0.3)
+        if pressed.fault:
+            raise DriverError(f"press: {firm:.3g} N at {name} stopped the hand: {pressed.fault}")
+        got = _inwards(rig, before, pressed) - was
+        said = f"{name} was asked for {more:+.2g} N, and the tips feel {np.round(got, 2)} N more"
+        if np.abs(got).max() < IGNORED * more:
+            raise DriverError(f"press is ignored: {said}")
+        if got[i] < -IGNORED * more:
+            raise DriverError(f"press has the wrong sign: {said}")
+        if got[i] < FOLLOWED * more or np.delete(got, i).max(initial=0.0) > FOLLOWED * more:
+            raise DriverError(f"press turns the wrong joint: {said}")
+        _must_read(rig, f"when {name} presses", torque, pressed.torque.mean(axis=0))
+        _must_rise_slowly(rig, rising, i, torque)
+        rig.driver.press(_torque(rig, q, np.full(k, light)))
+        rig.wait(FOLLOWS)
+    if rig.robot.arm:
+        stood = np.abs(rig.wait(0.1).q[-1] - arm)[list(rig.robot.arm)]
+        if stood.max() > NEAR:
+            j = rig.robot.arm[int(stood.argmax())]
+            raise DriverError(f"press: {rig.joint(j)} carries the palm, and moved")
+
+
+def _must_rise_slowly(rig: Rig, rising: Readings, i: int, torque: np.ndarray) -> None:
+    window = max(1, round(WINDOW * rig.driver.rate))
+    fingers = list(rig.robot.flexion[i])
+    steps = np.abs(rising.torque[window:] - rising.torque[:-window])[:, fingers].max()
+    most = PRESS_RATE * (window + 1) / rig.driver.rate
+    if steps > most + WINDOW_TOLERANCE * float(np.abs(torque).max()):
+        raise DriverError(
+            f"press is not slow: the torque of {rig._names[i]} changed by {steps:.2g} N·m within "
+            f"{window / rig.driver.rate:.2g} s; {PRESS_RATE:g} N·m/s is the most"
+        )
+
+
+def pressing_ends(rig: Rig) -> None:
+    """A stop, a move, and a caller that falls silent end what is pressed."""
+    before, (light, firm), pressed = _pressed(rig, firmly=False)
+    q, k = pressed.q.mean(axis=0), len(rig.normals)
+    more = _torque(rig, q, np.full(k, firm))
+    rig.driver.press(more)
+    rig.driver.wait(0.25 * (1.0 - LIGHT) * float(np.abs(more).max()) / PRESS_RATE)
+    rig.driver.stop()  # on the way: a stiff hand that stands may be as tight as it was
+    rig.wait(FOLLOWS)
+    left = _inwards(rig, before, rig.wait(0.3))
+    if (left > light + FOLLOWED * (firm - light)).any():
+        raise DriverError(
+            f"press does not end at a stop: on its way from {light:.2g} to {firm:.2g} N, it went "
+            f"on to {np.round(left, 2)} N"
+        )
+    before, _, pressed = _pressed(rig, firmly=True)
+    was = _inwards(rig, before, pressed)
+    rig.go(rig.open, 0.5)
+    left = _inwards(rig, before, rig.wait(0.3))
+    if (left > ENDED * was).any():
+        raise DriverError(
+            f"press does not end at a move: the tips pressed with {np.round(was, 2)} N, and do "
+            f"with {np.round(left, 2)} N"
+        )
+    _pressed(rig, firmly=True)
+    if not rig.driver.wait(rig.driver.limits.watchdog + 0.5).fault:
+        raise DriverError(
+            "press does not end at the watchdog: nobody called for longer than that, and "
+            "Readings.fault says nothing"
+        )
+
+
+def pressing_on_nothing_stops(rig: Rig) -> None:
+    """Fingers that are pressed open in free air stop the hand, and were not too fast."""
+    rig.go(rig.free[0])
+    closing = rig.robot.closing.sum(axis=0)
+    share = np.where(closing != 0.0, np.abs(closing) / rig.driver.limits.torque, 0.0).max()
+    rig.driver.press(-0.3 * closing / share)
+    seen = rig.wait(NOTHING)
+    fastest = np.abs(seen.velocity).max(axis=0) / rig.driver.limits.speed
+    if fastest.max() > SPEED_TOLERANCE:
+        j = int(fastest.argmax())
+        raise DriverError(
+            f"limits not held: {rig.joint(j)} pressed on nothing, and ran at {fastest[j]:.3g} of "
+            "its speed limit"
+        )
+    if not seen.fault:
+        raise DriverError("press: fingers pressed on nothing, and the hand did not stop itself")
+    _must_stand(rig, rig.wait(0.5).q, "press: fingers pressed on nothing")
+
+
+def carrying_keeps_what_is_pressed(rig: Rig) -> None:
+    """The arm goes where it is carried, and the fingers press on, whatever is asked of them."""
+    rig.go(rig.open)
+    with suppress(InputError):
+        rig.driver.carry(rig.open, 0.5)
+        raise DriverError("carry: a hand that presses nothing was carried; it raises InputError")
+    before, _, pressed = _pressed(rig, firmly=True)
+    was, q = _inwards(rig, before, pressed), pressed.q.mean(axis=0)
+    target, j = q.copy(), None
+    target[_fingers(rig)] = rig.open[_fingers(rig)]
+    if rig.robot.arm:  # the joint that moves the tips least, for the thing stands still
+        J = rig.robot.jacobian(q).reshape(len(was), 3, -1)
+        way = np.linalg.norm(J, axis=1).max(axis=0)
+        j = min(rig.robot.arm, key=lambda joint: float(way[joint]))
+        by = min(CARRIED / max(float(way[j]), 1e-3), TRAVEL)
+        target[j] += by if target[j] + by <= rig.driver.limits.upper[j] else -by
+    moved = rig.wait(rig.driver.carry(target, 0.5) + 0.3)
+    rest = rig.wait(0.3)
+    if rest.fault:
+        raise DriverError(f"carry: the hand stopped itself: {rest.fault}")
+    if (_inwards(rig, before, rest) < FOLLOWED * was).any():
+        raise DriverError("carry drops what is pressed")
+    if j is not None:
+        asked, did = target[j] - q[j], float(moved.q[-1, j] - q[j])
+        if did * asked < FOLLOWED * asked**2:
+            raise DriverError(
+                f"carry does not move: {rig.joint(j)} was sent by {asked:+.3f} rad and reads "
+                f"{did:+.3f}"
+            )
+
+
+def grip_forces_are_kept(rig: Rig) -> None:
+    """However hard the fingers are told to press, the force stays below its limit."""
+    limits = rig.driver.limits
+    *_, pressed = _pressed(rig, firmly=True)
+    torque = _torque(rig, pressed.q.mean(axis=0), np.ones(len(rig.normals)))
+    room = np.abs(torque) / limits.torque
+    seen = [pressed]
+    for share in (1.0, 2.0):
+        with suppress(InputError):  # a driver may refuse what is beyond its torque limit
+            rig.driver.press(share * torque / room.max())
+        seen.append(rig.wait(2.0))
+    rig.driver.stop()
+    rig.go(rig.open)
+    _must_stay_below("pressing, a fingertip felt", seen, limits.grip)
+
+
 # In the order in which they are safe to run: what holds the hand back comes before what needs it.
 CHECKS: tuple[Callable[[Rig], None], ...] = (
     samples_come_at_the_stated_rate,
@@ -337,6 +577,12 @@ CHECKS: tuple[Callable[[Rig], None], ...] = (
     tips_weigh_what_they_weigh,
     closing_ends_at_a_touch,
     contact_forces_are_kept,
+    torques_are_those_that_fingers_hold_with,
+    pressing_is_followed_slowly,
+    pressing_ends,
+    pressing_on_nothing_stops,
+    carrying_keeps_what_is_pressed,
+    grip_forces_are_kept,
 )
 
 

@@ -295,8 +295,9 @@ class PhysicalProbe:
         names = self._names
         if held.fault:
             return Missed(Miss.BLOCKED, held.fault)
-        silent = _silent(held)
-        if silent.any() and not silent.all():
+        # At rest a sensor without any noise may repeat itself.
+        silent = _silent(held) & self._variance(free).any(axis=1)
+        if silent.any():
             return Missed(Miss.SENSOR, names[int(silent.argmax())])
         q = np.clip(held.q.mean(axis=0), robot.q_lower, robot.q_upper)
         robot.place(self._data, q)
