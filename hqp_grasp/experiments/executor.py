@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
 from hqp_grasp.experiments.fingerprint import Fingerprint, differences
+from hqp_grasp.hierarchy.compiled import Turn, take_turns
 
 T = TypeVar("T")
 Done = Generator[tuple[int, T | None], None, None]
@@ -66,17 +67,18 @@ def run_all(
 def _in_processes(work: Callable[[int], T], numbers: Sequence[int], jobs: int) -> Done[T]:
     waiting = deque(numbers)
     worked = False
+    turn = get_context("spawn").Semaphore(1)
     with _one_blas_thread():
         while waiting:
             suspects: list[int] = []  # under way when a process died
-            for i, result in _in_pool(work, waiting, jobs, suspects):
+            for i, result in _in_pool(work, waiting, jobs, suspects, turn):
                 worked = True
                 yield i, result
             given_up = []
             for i in suspects:
                 for _ in range(DEATHS):
                     died: list[int] = []
-                    for _, result in _in_pool(work, deque([i]), 1, died):
+                    for _, result in _in_pool(work, deque([i]), 1, died, turn):
                         worked = True
                         yield i, result
                     if not died:
@@ -92,10 +94,13 @@ def _in_processes(work: Callable[[int], T], numbers: Sequence[int], jobs: int) -
 
 
 def _in_pool(
-    work: Callable[[int], T], waiting: deque[int], jobs: int, suspects: list[int]
+    work: Callable[[int], T], waiting: deque[int], jobs: int, suspects: list[int], turn: Turn
 ) -> Generator[tuple[int, T], None, None]:
-    """Work until nothing is waiting, or a process dies: `suspects` are then those under way."""
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    """Work until nothing is waiting, or a process dies: `suspects` are then those under way.
+
+    `turn` is taken by the process that says that it compiles the solver.
+    """
+    with ProcessPoolExecutor(jobs, get_context("spawn"), take_turns, (turn,)) as pool:
         under_way: dict[Any, int] = {}
         try:
             while under_way or (waiting and not suspects):

@@ -3,6 +3,7 @@
 import json
 import socket
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,6 +14,7 @@ from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
 from hqp_grasp.experiments import executor
 from hqp_grasp.experiments.executor import address_of, run_all
 from hqp_grasp.experiments.fingerprint import Fingerprint
+from hqp_grasp.hierarchy import compiled
 
 NO_DASK = "no distributed: pip install 'hqp_grasp[cluster]'"
 
@@ -51,6 +53,19 @@ def test_where_no_process_does_anything_the_study_ends():
 def test_what_the_work_raises_is_raised():
     with pytest.raises(RuntimeError, match="not here"):
         list(run_all(raises, range(4), jobs=2))
+
+
+def test_that_the_solver_is_compiled_is_said_once_and_only_then(monkeypatch, capsys):
+    monkeypatch.setattr(compiled._NOTICE, "turn", threading.Semaphore(1))
+    list(run_all(Square(), range(4)))
+    assert capsys.readouterr().err == ""
+    list(run_all(compiles, range(4)))
+    assert capsys.readouterr().err.strip() == compiled.LINE
+
+
+def test_that_the_solver_is_compiled_is_said_by_one_of_several_processes(capfd):
+    list(run_all(compiles, range(4), jobs=2))
+    assert capfd.readouterr().err.strip() == compiled.LINE
 
 
 def test_few_numbers_are_under_way_at_a_time(monkeypatch):
