@@ -13,6 +13,7 @@ from tyro.extras import SubcommandApp
 import hqp_grasp.scenarios
 from hqp_grasp.errors import HqpGraspError, one_of
 from hqp_grasp.experiments import report as reports
+from hqp_grasp.experiments.plain import speak_plainly
 from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.experiments.view import HOST, PORT, serve
 
@@ -82,6 +83,7 @@ def robot(
 
 def main() -> None:
     """Run the command that the arguments name; what is wrong is said in one line."""
+    speak_plainly()
     try:
         if sys.argv[1:2] == ["run"] and len(sys.argv) > 2 and not sys.argv[2].startswith("-"):
             name = sys.argv[2]

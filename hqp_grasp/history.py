@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from hqp_grasp.errors import ResultsError
+from hqp_grasp.files import whole_file
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 
 FORMER = ("confidence",)  # of contacts in older files; nothing ever read it
@@ -21,17 +21,9 @@ def save_history(path: str | Path, history: Sequence[Touch]) -> None:
 
     Raises ResultsError where the file cannot be written.
     """
-    path = Path(path)
-    part = path.with_suffix(f".{os.getpid()}.part")
     text = json.dumps([_plain(touch) for touch in history])
-    try:
-        try:
-            part.write_text(text)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise ResultsError(f"{path} cannot be written: {error.strerror or error}") from error
+    with whole_file(path) as part:
+        part.write_text(text)
 
 
 def load_history(path: str | Path) -> tuple[Touch, ...]:

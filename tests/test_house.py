@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "hqp_grasp"
 # above, nor from another folder of its floor.
 FLOORS = (
     ("errors",),
+    ("files",),
     ("grasp",),
     ("mechanics",),
     ("history", "hierarchy", "world"),

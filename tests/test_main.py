@@ -1,11 +1,13 @@
 """The package's command line: scenarios without their folder, reports."""
 
+import io
 import subprocess
 import sys
 
 import pyarrow.parquet as pq
 import pytest
 
+import hqp_grasp as hg
 from hqp_grasp.__main__ import main
 
 
@@ -38,3 +40,45 @@ def test_a_scenario_runs_by_its_name_and_is_reported(monkeypatch, capsys, tmp_pa
 def test_what_is_wrong_is_said_in_one_line(monkeypatch, arguments, message):
     with pytest.raises(SystemExit, match=message):
         call(monkeypatch, *arguments)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    out = tmp_path_factory.mktemp("results")
+    trial = hg.Trial(hg.Scene("bhand"), hg.ForceTask() >> hg.MomentTask(), probes=2)
+    hg.Study(trial, trials=1).run(out)
+    return out
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "cylinder", "--trials", "1", "--probes", "1", "--robot", "bhand", "--replay", "0"),
+        ("run", "cylinder", "--help"),
+        ("run", "cyclinder"),
+        ("report", "RESULTS"),
+        ("report", "nowhere"),
+        ("robot", "bhand"),
+        ("robot", "--help"),
+        ("view", "nowhere"),
+        ("--help",),
+    ],
+    ids=" ".join,
+)
+def test_every_command_speaks_to_any_terminal(monkeypatch, tmp_path, results, encoding, arguments):
+    streams = {name: io.BytesIO() for name in ("stdout", "stderr")}
+    for name, stream in streams.items():
+        monkeypatch.setattr(sys, name, io.TextIOWrapper(stream, encoding, write_through=True))
+    monkeypatch.chdir(tmp_path)
+    arguments = [str(results) if word == "RESULTS" else word for word in arguments]
+    try:
+        call(monkeypatch, *arguments)
+    except SystemExit as end:
+        print("" if end.code is None else end.code, file=sys.stderr)  # as Python does
+    said = "".join(stream.getvalue().decode(encoding) for stream in streams.values())
+    assert len(said) > 20 and "Traceback" not in said
+    if encoding == "utf-8" and arguments[0] == "run" and len(arguments) > 3:
+        assert "force ▷ moment ▷ kinematic" in said
+    elif arguments[0] == "run" and len(arguments) > 3:
+        assert "force > moment > kinematic" in said

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import io
 import json
 import logging
 import os
+import pickle
 import re
 import sys
 import threading
@@ -21,6 +23,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from time import monotonic
+from types import FunctionType
 from typing import Any, TypeVar
 
 from tqdm import tqdm
@@ -58,27 +61,59 @@ def run_all(
         return _on_cluster(work, numbers, address_of(cluster))
     if jobs == 1 or len(numbers) < 2:
         return ((i, work(i)) for i in numbers)
-    return _in_processes(work, numbers, jobs)
+    return _in_processes(pickled(work), numbers, jobs)
 
 
 # ---------------------------------------------------------------- processes of this machine
 
 
-def _in_processes(work: Callable[[int], T], numbers: Sequence[int], jobs: int) -> Done[T]:
+class _Pickler(pickle.Pickler):
+    """Takes down which classes and functions are those of the script that runs."""
+
+    def __init__(self, stream: io.BytesIO) -> None:
+        super().__init__(stream)
+        self.own: list[str] = []
+
+    def reducer_override(self, thing: Any) -> Any:
+        if isinstance(thing, type | FunctionType) and thing.__module__ == "__main__":
+            self.own.append(thing.__qualname__)
+        return NotImplemented
+
+
+def pickled(work: object) -> bytes:
+    """What goes to other processes; InputError for what they could not read."""
+    way_out = "put it into a module, a .py file, and import it from there, or take jobs=1"
+    stream = io.BytesIO()
+    pickler = _Pickler(stream)
+    try:
+        pickler.dump(work)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InputError(f"jobs above 1 run in other processes, and {error}: {way_out}") from error
+    script = sys.modules["__main__"]
+    if script.__spec__ is None and not Path(vars(script).get("__file__", "")).is_file():
+        for name in pickler.own:
+            raise InputError(
+                f"jobs above 1 run in other processes, and these cannot read {name}, which was "
+                f"typed in (python -c, standard input, a notebook): {way_out}"
+            )
+    return stream.getvalue()
+
+
+def _in_processes(payload: bytes, numbers: Sequence[int], jobs: int) -> Done[Any]:
     waiting = deque(numbers)
     worked = False
     turn = get_context("spawn").Semaphore(1)
     with _one_blas_thread():
         while waiting:
             suspects: list[int] = []  # under way when a process died
-            for i, result in _in_pool(work, waiting, jobs, suspects, turn):
+            for i, result in _in_pool(payload, waiting, jobs, suspects, turn):
                 worked = True
                 yield i, result
             given_up = []
             for i in suspects:
                 for _ in range(DEATHS):
                     died: list[int] = []
-                    for _, result in _in_pool(work, deque([i]), 1, died, turn):
+                    for _, result in _in_pool(payload, deque([i]), 1, died, turn):
                         worked = True
                         yield i, result
                     if not died:
@@ -94,8 +129,8 @@ def _in_processes(work: Callable[[int], T], numbers: Sequence[int], jobs: int) -
 
 
 def _in_pool(
-    work: Callable[[int], T], waiting: deque[int], jobs: int, suspects: list[int], turn: Turn
-) -> Generator[tuple[int, T], None, None]:
+    payload: bytes, waiting: deque[int], jobs: int, suspects: list[int], turn: Turn
+) -> Generator[tuple[int, Any], None, None]:
     """Work until nothing is waiting, or a process dies: `suspects` are then those under way.
 
     `turn` is taken by the process that says that it compiles the solver.
@@ -106,7 +141,7 @@ def _in_pool(
             while under_way or (waiting and not suspects):
                 while waiting and not suspects and len(under_way) < IN_FLIGHT * jobs:
                     try:
-                        under_way[pool.submit(work, waiting[0])] = waiting[0]
+                        under_way[pool.submit(_do_pickled, payload, waiting[0])] = waiting[0]
                     except BrokenProcessPool:
                         break
                     waiting.popleft()
@@ -121,6 +156,23 @@ def _in_pool(
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+
+
+def _do_pickled(payload: bytes, i: int) -> Any:
+    """One task, in a process."""
+    return _unpickled(payload)(i)
+
+
+@lru_cache(maxsize=1)
+def _unpickled(payload: bytes) -> Callable[[int], Any]:
+    """The work; what it was made of may not be there, as what a script defines where it starts."""
+    try:
+        return pickle.loads(payload)
+    except (AttributeError, ImportError) as error:
+        raise WorkerError(
+            f"another process does not find what this one has ({error}): define it at the top of "
+            'a module, above any `if __name__ == "__main__":`'
+        ) from error
 
 
 @contextmanager

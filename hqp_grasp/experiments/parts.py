@@ -13,6 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from hqp_grasp.files import whole_file
+
 BATCH = 500  # trials in a file of several
 OPEN = 4  # files of several trials held in memory while merging
 
@@ -120,17 +122,16 @@ def _read(path: Path) -> pa.Table:
 
 def _write(tables: Iterable[pa.Table], path: Path, keep: bool = False) -> None:
     """Write the whole file, a row group a table, or nothing; what is to stay, small and safely."""
-    part = path.with_suffix(f".{os.getpid()}.part")
     tables = iter(tables)
     first = next(tables)
     packing = "zstd" if keep else "snappy"
-    with pq.ParquetWriter(
-        part, first.schema, compression=packing, write_page_checksum=True
-    ) as file:
-        file.write_table(first)
-        for table in tables:
-            file.write_table(table)
-    if keep:
-        with part.open("rb") as written:
-            os.fsync(written.fileno())
-    part.replace(path)
+    with whole_file(path) as part:
+        with pq.ParquetWriter(
+            part, first.schema, compression=packing, write_page_checksum=True
+        ) as file:
+            file.write_table(first)
+            for table in tables:
+                file.write_table(table)
+        if keep:
+            with part.open("rb") as written:
+                os.fsync(written.fileno())

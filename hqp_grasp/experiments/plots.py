@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
+from hqp_grasp.files import whole_file
 
 FORCE, MOMENT, ANGLE = "#0072b2", "#d55e00", "#009e73"
 FLOOR = 1e-16  # errors below are drawn here
@@ -18,9 +19,8 @@ FLOOR = 1e-16  # errors below are drawn here
 
 def convergence(table: pa.Table, title: str, path: Path) -> None:
     """Draw `convergence_figure` into the file `path`, whole or not at all."""
-    part = path.with_suffix(".part.png")
-    convergence_figure(table, title).savefig(part, dpi=130)
-    part.replace(path)
+    with whole_file(path) as part:
+        convergence_figure(table, title).savefig(part, dpi=130, format="png")
 
 
 def convergence_figure(table: pa.Table, title: str) -> Figure:

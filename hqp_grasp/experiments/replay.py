@@ -27,6 +27,7 @@ from hqp_grasp.experiments.record import (
     CONVERGED_MOMENT,
     Record,
 )
+from hqp_grasp.files import whole_file
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
@@ -328,9 +329,8 @@ def write_replay(
             recording.insert_sleep(SECONDS_A_PROBE)
         page = recording.as_html()
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
-    part = path.with_suffix(".part")
-    part.write_text(page, encoding="utf-8")
-    part.replace(path)
+    with whole_file(path) as part:
+        part.write_text(page, encoding="utf-8")
 
 
 @contextlib.contextmanager

@@ -8,6 +8,8 @@ import matplotlib
 import mujoco
 import numpy as np
 
+from hqp_grasp.errors import one_of
+from hqp_grasp.files import whole_file
 from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.description import CARRIAGE, RobotDescription
 from hqp_grasp.world.robot import CAPSULE, CENTRED, SPHERE, Robot, compiled, described
@@ -256,5 +258,8 @@ def draw(robot: Robot, path: str | Path) -> None:
         axes.text(*place, point.name)
     axes.set_aspect("equal")
     axes.legend()
-    figure.savefig(path, dpi=120)
+    valid = sorted(figure.canvas.get_supported_filetypes())
+    kind = one_of("kind of picture", Path(path).suffix.removeprefix("."), valid)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=120, format=kind)
     plt.close(figure)

@@ -19,7 +19,8 @@ import tyro
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.control.settling import BEYOND
-from hqp_grasp.errors import HqpGraspError, InputError, TrialError
+from hqp_grasp.errors import HqpGraspError, InputError, ResultsError, TrialError
+from hqp_grasp.experiments.plain import speak_plainly
 from hqp_grasp.experiments.plots import convergence
 from hqp_grasp.experiments.record import (
     CONVERGED_FORCE,
@@ -118,6 +119,7 @@ def main(name: str, scene: Scene | Callable[[], Scene], settings: Settings | Non
 
     A scene from a file is given as the function that reads it.
     """
+    speak_plainly()
     try:
         scene = scene if isinstance(scene, Scene) else scene()
         chosen = settings or tyro.cli(Settings, prog=f"{name}.py", description=_about(name, scene))
@@ -188,13 +190,17 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
     except TrialError as error:
         command = replay_command(scene, settings, error.trial)
         raise TrialError(f"{error}; replay it:\n{command}", error.trial) from error
-    figure = out / "convergence.png"
-    convergence(table, about, figure)
     print(summary(table))
     if failed:
         command = replay_command(scene, settings, failed[0])
         print(f"\nreplay trial {failed[0]}, the first that ended in an error:\n{command}")
-    print(f"\nresults  {out / 'probes.parquet'}\nfigure   {figure}")
+    print(f"\nresults  {out / 'probes.parquet'}")
+    figure = out / "convergence.png"
+    try:
+        convergence(table, about, figure)
+        print(f"figure   {figure}")
+    except ResultsError as error:  # the results stand without it
+        print(f"figure   none: {error}")
     _replay(scene, settings.replay, out, name)
     return table
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -25,9 +24,10 @@ from hqp_grasp.errors import (
     flag,
     whole,
 )
-from hqp_grasp.experiments.executor import DEATHS, address_of, run_all, tell
+from hqp_grasp.experiments.executor import DEATHS, address_of, pickled, run_all, tell
 from hqp_grasp.experiments.fingerprint import Fingerprint, cpu_kind, differences
 from hqp_grasp.experiments.parts import Parts
+from hqp_grasp.files import sweep, whole_file
 from hqp_grasp.world.scene import Scene
 
 STUDY_COLUMNS = {
@@ -115,6 +115,8 @@ class Study:
         further trials too, where the folder has them.
         """
         out, whole = Path(out), Path(out) / self.trial.file
+        if self.jobs > 1 and self.trials > 1 and self.cluster is None:
+            pickled(_Work(self.trial, self.seed))  # raises, before there is a folder
         with _claimed(out, self.configuration()) as folder:
             self.trial.scene.save(out / "scene.json")  # for whoever draws it
             parts = Parts(folder)
@@ -147,8 +149,8 @@ class Study:
                         return TrialError(told, i)
                     if not begins:
                         return TrialError(f"{told}; no other trial is run", i)
-            except WorkerError as error:
-                raise WorkerError(
+            except (WorkerError, ResultsError) as error:
+                raise type(error)(
                     f"{error}; {len(parts)} trials are in {out}, and the same command continues"
                 ) from error
         return None
@@ -192,6 +194,8 @@ def _claimed(out: Path, configuration: dict[str, object]) -> Iterator[Path]:
         parts.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=parts):
             pass
+        for folder in (out, parts):
+            sweep(folder)
     except OSError as error:
         raise ResultsError(f"{out} cannot be written: {error.strerror or error}") from error
     config = out / "config.json"
@@ -200,9 +204,8 @@ def _claimed(out: Path, configuration: dict[str, object]) -> Iterator[Path]:
     elif any(parts.iterdir()):
         raise ResultsError(f"{out} holds results without a config.json; take another folder")
     else:
-        fresh = config.with_suffix(f".{os.getpid()}.part")
-        fresh.write_text(json.dumps(configuration, indent=2) + "\n")
-        fresh.replace(config)
+        with whole_file(config) as fresh:
+            fresh.write_text(json.dumps(configuration, indent=2) + "\n")
     with config.open() as held:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from hqp_grasp.errors import InputError, instance, one_of, positive
+from hqp_grasp.errors import InputError, instance, not_negative, one_of, positive
 from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.touch.driver import PRESS_RATE, DriverLimits, Readings
 from hqp_grasp.touch.geometric import OVERLAP, RETREAT
@@ -84,6 +84,7 @@ class SimulatedHand:
         rng = np.random.default_rng(0) if rng is None else rng
         instance("SimulatedHand.rng", rng, np.random.Generator)
         force_limit = positive("SimulatedHand.force_limit", force_limit)
+        grip_limit = not_negative("SimulatedHand.grip_limit", grip_limit)
         about, timestep = physics.imperfections, physics.timestep
         self.robot = scene.articulated
         k, n = len(self.robot.flexion), self.robot.n

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from hqp_grasp.errors import HqpGraspError, InputError, ResultsError
+from hqp_grasp.files import whole_file
 from hqp_grasp.grasp import as_array
 from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import RobotDescription
@@ -108,7 +109,8 @@ class Scene:
         thing = {"kind": type(self.object).__name__} | given
         data = {"robot": robot, "object": thing, "position": self.position, "base": self.base}
         data |= {} if self.hand is None else {"hand": self.hand}
-        Path(path).write_text(json.dumps(data, indent=2) + "\n")
+        with whole_file(path) as part:
+            part.write_text(json.dumps(data, indent=2) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:

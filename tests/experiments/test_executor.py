@@ -1,14 +1,16 @@
 """Work is done wherever it is sent, again where a process dies, and never waited for in vain."""
 
 import json
+import pickle
 import socket
+import subprocess
 import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from deadly import Slow, Square, raises
+from deadly import Slow, Square, compiles, raises
 
 from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
 from hqp_grasp.experiments import executor
@@ -68,12 +70,49 @@ def test_that_the_solver_is_compiled_is_said_by_one_of_several_processes(capfd):
     assert capfd.readouterr().err.strip() == compiled.LINE
 
 
+TYPED_IN = """
+import hqp_grasp as hg
+class MyTask(hg.ForceTask): pass
+trial = hg.Trial(hg.Scene("bhand"), MyTask() >> hg.MomentTask(), probes=1)
+try:
+    hg.Study(trial, trials=2, jobs=2).run({out!r})
+except hg.InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("way", ["-c", "stdin"])
+def test_what_was_typed_in_is_refused_before_any_process_or_folder(way, tmp_path):
+    script = TYPED_IN.format(out=str(tmp_path / "out"))
+    command = [sys.executable, *(("-c", script) if way == "-c" else ("-",))]
+    done = subprocess.run(command, input=script, capture_output=True, text=True, check=True)
+    assert "cannot read MyTask, which was typed in (python -c, standard input, a n" in done.stdout
+    assert "a .py file, and import it from there, or take jobs=1" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_pickled_is_refused_with_the_way_out():
+    with pytest.raises(InputError, match=r"(?s)jobs above 1 .*<lambda>.*or take jobs=1"):
+        run_all(lambda i: i, range(4), jobs=2)
+
+
+def test_what_another_process_does_not_find_is_said():
+    payload = pickle.dumps(Square()).replace(b"Square", b"Cubics")
+    with pytest.raises(WorkerError, match=r"does not find .*Cubics.* at the top of a module"):
+        executor._unpickled(payload)
+
+
+def test_a_process_reads_its_work_once():
+    payload = pickle.dumps(Square())
+    assert executor._unpickled(payload) is executor._unpickled(pickle.dumps(Square()))
+
+
 def test_few_numbers_are_under_way_at_a_time(monkeypatch):
     submitted, submit = [], executor.ProcessPoolExecutor.submit
 
-    def counted(pool, work, i):
+    def counted(pool, do, payload, i):
         submitted.append(i)
-        return submit(pool, work, i)
+        return submit(pool, do, payload, i)
 
     monkeypatch.setattr(executor.ProcessPoolExecutor, "submit", counted)
     for done, _ in enumerate(run_all(Square(), range(40), jobs=2)):
