@@ -137,6 +137,14 @@ def test_what_is_neither_address_nor_file_is_said(cluster, tmp_path, monkeypatch
         address_of(cluster)
 
 
+def test_a_cluster_object_is_told_to_give_its_address():
+    class LocalCluster:
+        scheduler_address = "tcp://127.0.0.1:8786"
+
+    with pytest.raises(InputError, match=r"cluster\.scheduler_address .* got a LocalCluster"):
+        address_of(LocalCluster())
+
+
 @pytest.mark.parametrize("text", ["{", "[]", "{}"])
 def test_a_file_that_no_scheduler_wrote_is_said(text, tmp_path):
     (tmp_path / "s.json").write_text(text)
