@@ -82,7 +82,10 @@ class HQP:
         found: list[tuple[tuple[int, float], Solution]] = []
         left = self.budget
         for method, seen, act, first, rounds in self._ways(rows, warm, failed):
-            x, multipliers, rank, _, spent = active_set.search(seen, act, first, rounds, left // 2)
+            # A guess that needs many steps is dropped: from the equalities the search is surer.
+            guess = rounds > 0 and first > 1
+            most = left // 4 if guess else left - left // 3
+            x, multipliers, rank, _, spent = active_set.search(seen, act, first, rounds, most)
             left -= min(spent, left)
             judged = optimality(rows, x, multipliers, shortest=True)
             off = rows.offsets.tolist()
