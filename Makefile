@@ -147,6 +147,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,solvers-sizes,benchmarks/solvers.py --sizes --problems 150 --checked 2 --plot docs/images/solvers.png)
 	$(call keep,fuzz,benchmarks/fuzz.py --problems 100000 --seed 3)
 	$(call keep,fuzz-active-set,benchmarks/fuzz.py --problems 20000 --seed 3 --solver active-set)
+	$(call keep,fuzz-forces,benchmarks/fuzz.py --kind forces --problems 2000 --seed 4 --solver active-set)
 	$(call keep,fuzz-oracle,benchmarks/fuzz.py --kind general --problems 2500 --seed 5 --against-oracle)
 	@set -e; for kind in easy mid hard; do for solver in proxqp daqp; do \
 	  $(PY) benchmarks/fuzz.py --kind three_level-$$kind --problems 1000 --solver $$solver --against-oracle; \
