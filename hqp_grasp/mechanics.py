@@ -17,8 +17,8 @@ from hqp_grasp.errors import InputError, SolverError, positive
 from hqp_grasp.grasp import UNIT_NORMAL_TOLERANCE, as_array
 
 FLOOR = 0.2  # [–] of the mean normal force that each contact keeps: none only looks on
-FLAT = 1e-9  # [–] singular value, of the largest, that counts as none
-MILD = 1e-2  # [–] singular value, of the largest, that is far from none
+FLAT = 1e-9  # [–] singular value that counts as none, where the largest is about 1
+MILD = 1e-2  # [–] singular value that is far from none
 CENTRED = 0.25  # Newton decrement at which a point counts as the centre
 SHARE = 0.9  # of the way to the boundary that a prediction goes
 DEMANDED = 1e-9  # [–] to which the friction demand is found
@@ -137,14 +137,15 @@ def friction_demand(positions: ArrayLike, normals: ArrayLike) -> float:
     basis = frame @ Vt[rank:].T.reshape(k, 3, 3 * k - rank)
     A = basis[:, 0]
     # A start: normal forces as equal as can be, by tangential ones of their size where those do.
+    U, sigma, Vt = np.linalg.svd(A, full_matrices=False)
+    along = U.T @ (1.0 - start[:, 0])
     for least in (MILD, FLAT):
-        w = np.linalg.lstsq(A, 1.0 - start[:, 0], rcond=least)[0]
+        kept = sigma > least
+        w = Vt[kept].T @ (along[kept] / sigma[kept])
         if (start[:, 0] + A @ w).min() > FLOOR + FLAT:
             break
     else:
         w = _widest(start[:, 0], A)
-        if not (start[:, 0] + A @ w).min() > FLOOR + FLAT:
-            return np.inf
     return float(_least_friction(start, np.ascontiguousarray(basis), w))
 
 
@@ -212,7 +213,7 @@ def _least_friction(start, basis, w):  # type: ignore[no-untyped-def]
     """
     k, _, p = basis.shape
     best = _needed(start, basis, w, FLOOR)
-    if p == 0:
+    if p == 0 or best == np.inf:
         return best
     mu = 1.5 * best + DEMANDED
     H = np.empty((p, p))

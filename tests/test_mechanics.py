@@ -143,7 +143,8 @@ def test_the_demand_stays_where_the_grasp_is_moved_scaled_or_told_in_another_ord
         there, order = friction_demand(x, n), rng.permutation(k)
         R, p = turned(rng), rng.normal(size=3)
         assert friction_demand(x @ R.T + p, n @ R.T) == pytest.approx(there, abs=FOUND)
-        assert friction_demand(7.0 * x, n) == pytest.approx(there, abs=FOUND)
+        for scale in (7.0, 1e-9):
+            assert friction_demand(scale * x, n) == pytest.approx(there, abs=FOUND)
         assert friction_demand(x[order], n[order]) == pytest.approx(there, abs=FOUND)
 
 
@@ -196,10 +197,26 @@ def test_rounding_in_grasps_of_parallel_plates_changes_nothing(k, noise):
     rng = np.random.default_rng(6)
     side = np.where(np.arange(k) % 2, 1.0, -1.0)
     flat = np.column_stack([side, np.zeros(k), np.zeros(k)])
-    x = 0.03 * flat + np.array([0.0, 0.02, 0.02]) * rng.normal(size=(k, 3))
-    n = unit(flat + noise * rng.normal(size=(k, 3)))
-    there = friction_demand(x, flat)
-    assert friction_demand(x, n) == pytest.approx(there, rel=3e-6, abs=max(3e-6, 10.0 * noise))
+    for _ in range(6):
+        x = 0.03 * flat + np.array([0.0, 0.02, 0.02]) * rng.normal(size=(k, 3))
+        n = unit(flat + noise * rng.normal(size=(k, 3)))
+        there = friction_demand(x, flat)
+        near = max(3e-6, 10.0 * noise) * (1.0 + there)
+        assert friction_demand(x, n) == pytest.approx(there, abs=near)
+
+
+def beam(*places):
+    """Contacts along a beam [m], on its upper side, or with a minus sign below it."""
+    x = np.column_stack([np.abs(places), np.zeros((len(places), 2))])
+    return x, np.column_stack([np.zeros(len(places)), np.sign(places), np.zeros(len(places))])
+
+
+def test_levers_on_a_beam_bind_normal_forces_to_one_another():
+    assert friction_demand(*beam(0.10, -0.15, -0.08)) == pytest.approx(0.0, abs=FOUND)
+    # The far one has 0.05 of the near one's force, 0.07 of their mean: less than its share.
+    assert friction_demand(*beam(0.10, -0.15, -0.0975)) == np.inf
+    # The way nearest to equal forces has too little at one contact, another way has not.
+    assert friction_demand(*beam(0.10, -0.12, 0.14, 0.18)) == pytest.approx(0.0, abs=FOUND)
 
 
 def test_the_demand_asks_for_contacts_and_unit_normals():

@@ -317,13 +317,11 @@ class Grip:
 
         `wrench` (6,) [N, N·m] is what the contacts shall give to the object, about their centroid:
         what they are felt to give unless told otherwise, none where nothing is felt. `warm` is the
-        answer for a similar grasp with as many contacts: the active-set search starts from it.
+        answer for a similar grasp with as many contacts, where the active-set search starts from.
         """
         felt = self.felt(grasp, wrench)
         levels = self.levels(felt)
         start = warm.solution if warm is not None else None
-        if start is not None and len(start.active) != sum(len(level.lower) for level in levels):
-            start = None
         hqp = self.hqp if start is None else replace(self.hqp, solver="active-set")
         try:
             solution = hqp.solve(levels, start)

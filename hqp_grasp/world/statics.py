@@ -42,9 +42,7 @@ def weight_torque(robot: Robot, q: np.ndarray) -> np.ndarray:
 
 
 def holding(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Torques (N,) that hold the model's weight, after mj_kinematics and mj_comPos."""
-    data.qvel[:] = 0.0
-    mujoco.mj_comVel(model, data)
+    """Torques (N,) that hold the model's weight at rest, after mj_kinematics and mj_comPos."""
     torque = np.zeros(model.nv)
     mujoco.mj_rne(model, data, 0, torque)
     return torque

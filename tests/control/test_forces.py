@@ -129,6 +129,28 @@ def test_the_felt_moment_counts_the_torques_on_the_tips(robot):
     np.testing.assert_allclose(felt, wanted, atol=1e-12)
 
 
+def plates(robot):
+    """Two contacts that face each other, 10 cm apart."""
+    n = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    return touched(robot, robot.centers(robot.home).mean(axis=0) + 0.05 * n, n)
+
+
+def test_eight_edges_carry_a_load_askew_that_four_would_not(robot):
+    load = 4.5 / np.sqrt(2.0) * np.array([0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # 0.9 of two cones' most
+    squeeze = hg.Grip(robot, force=5.0, friction=0.5).solve(plates(robot), load)
+    assert short(squeeze, "net force") == short(squeeze, "grip strength") == 0.0
+
+
+def test_no_contact_pushes_with_more_than_the_most_whatever_it_should_carry(robot):
+    load = np.array([0.0, 0.0, 8.0, 0.0, 0.0, 0.0])
+    squeeze = hg.Grip(robot, force=5.0, friction=0.5, most=6.0).solve(plates(robot), load)
+    assert np.abs(squeeze.forces[:, 0]).max() == pytest.approx(6.0, abs=SMALL)
+    assert short(squeeze, "net force") == pytest.approx(8.0 - 2 * 0.5 * 6.0, abs=SMALL)
+    more = hg.Grip(robot, force=5.0, friction=0.5, most=25.0).solve(plates(robot), load)
+    assert short(more, "net force") == 0.0  # it squeezes harder than it was asked to
+    assert short(more, "grip strength") == pytest.approx(2 * 8.0 - 2 * 5.0, abs=SMALL)
+
+
 @pytest.mark.parametrize("k", [2, 3, 4, 5])
 def test_forces_keep_the_limits_whatever_is_felt(robot, k):
     rng = np.random.default_rng(k)

@@ -125,7 +125,7 @@ TENDON = """
   <tendon><fixed name="pull"><joint joint="proximal" coef="0.5"/>{more}</fixed></tendon>
   <actuator>
     <position joint="lift" kp="100" forcerange="-50 80"/>
-    <motor tendon="pull" forcerange="0 4"/>
+    <motor tendon="pull" gear="2" forcerange="0 2"/>
   </actuator>
 </mujoco>"""
 
