@@ -30,6 +30,7 @@ from hqp_grasp.hierarchy.level import Stacked
 ACCURACY = 1e-6  # [–] asked of a solver; what it names is settled exactly afterwards
 AT_BOUND = 1e-5  # [–] scaled slack or dual above which a row holds x; well above ACCURACY
 SLIGHT = 1e-9  # [–] of a row: no direction of its own; of a Hessian's trace: added to its diagonal
+KEPT = 32  # shapes of QPs whose solver objects are kept: those of a few hierarchies
 ITERATIONS = 25  # of proxqp, outer and in each: ten times what it takes where it converges
 
 MET, HOLDS = 1, 2  # states of a row: an inequality that is met, a row that takes freedom away
@@ -295,6 +296,8 @@ def _proxqp(
     shape = G.shape
     qp = _kept.by_shape.get(shape)
     if qp is None:
+        if len(_kept.by_shape) == KEPT:  # the oldest goes: each holds megabytes where rows are many
+            del _kept.by_shape[next(iter(_kept.by_shape))]
         qp = _kept.by_shape[shape] = proxsuite.proxqp.dense.QP(shape[1], 0, shape[0])
         settings = qp.settings
         settings.initial_guess = proxsuite.proxqp.NO_INITIAL_GUESS  # y = 0: where the levels stand
