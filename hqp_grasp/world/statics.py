@@ -52,8 +52,8 @@ def torque_limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Least and most that the motors of each independent joint give, (n,) each [N·m, N].
 
     From the actuators' `forcerange` and gear, where they drive joints or fixed tendons, and from
-    the joints' `actuatorfrcrange`. Raises ModelError for a joint that moves a contact point and
-    has no such limit, or that shares a motor with another one.
+    the joints' `actuatorfrcrange`; a motor's `ctrlrange` limits it too. Raises ModelError for a
+    joint that moves a contact point and has no such limit, or that shares a motor with another one.
     """
     model, C = robot.model, robot.coupling
     low, high = np.zeros(robot.n), np.zeros(robot.n)
@@ -68,11 +68,8 @@ def torque_limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
                 f"actuator {model.actuator(a).name!r} of {about} drives {names} at once: limits "
                 "on torques here are each joint's own"
             )
-        limit = (
-            model.actuator_forcerange[a] if model.actuator_forcelimited[a] else [-np.inf, np.inf]
-        )
         for j in joints:
-            ends = sorted(moved[j] * np.asarray(limit))
+            ends = sorted(moved[j] * _strength(model, a))
             low[j], high[j], driven[j] = low[j] + ends[0], high[j] + ends[1], True
     for full in np.flatnonzero(model.jnt_actfrclimited):
         (joints,) = np.nonzero(C[full])
@@ -88,6 +85,19 @@ def torque_limits(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
             'forcerange in the model, as <position joint="…" forcerange="-2 2"/>'
         )
     return low, high
+
+
+def _strength(model: mujoco.MjModel, actuator: int) -> np.ndarray:
+    """Least and most (2,) that an actuator pulls with, before its gear."""
+    least, most = -np.inf, np.inf
+    if model.actuator_forcelimited[actuator]:
+        least, most = model.actuator_forcerange[actuator]
+    plain = model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
+    plain &= model.actuator_biastype[actuator] == int(mujoco.mjtBias.mjBIAS_NONE)
+    if plain and model.actuator_ctrllimited[actuator]:  # a motor: its force is its control
+        low, high = sorted(model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator])
+        least, most = max(least, low), min(most, high)
+    return np.array([least, most])
 
 
 def _lever(model: mujoco.MjModel, actuator: int) -> np.ndarray:

@@ -121,6 +121,18 @@ def test_two_motors_of_a_joint_add_up_and_the_joints_own_limit_caps_them(tmp_pat
     np.testing.assert_allclose([low[1], high[1]], [-5.0, 4.0])
 
 
+def test_a_motors_control_limits_it_and_a_servos_does_not(tmp_path):
+    motor = change(MOTORS, 'forcerange="-2 2"', 'ctrlrange="-1 3"')
+    low, high = torque_limits(tiny(tmp_path, with_motors(motor)))
+    np.testing.assert_allclose([low[1], high[1]], [-3.0, 9.0])
+    both = change(MOTORS, 'forcerange="-2 2"', 'ctrlrange="-1 3" forcerange="-2 2"')
+    low, high = torque_limits(tiny(tmp_path, with_motors(both)))
+    np.testing.assert_allclose([low[1], high[1]], [-3.0, 6.0])
+    servo = change(MOTORS, 'kp="100" forcerange="-50 80"', 'kp="100" ctrlrange="-0.5 0.5"')
+    with pytest.raises(ModelError, match="no force limit for the motors of: lift; give"):
+        torque_limits(tiny(tmp_path, with_motors(servo)))
+
+
 TENDON = """
   <tendon><fixed name="pull"><joint joint="proximal" coef="0.5"/>{more}</fixed></tendon>
   <actuator>
