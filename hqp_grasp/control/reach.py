@@ -15,7 +15,7 @@ MAX_STEPS = 60
 STEP = 0.3  # [rad]
 TOLERANCE = 1e-4  # [m, rad]
 HOMING = 0.1  # [–] share of the way to home that joints which are free to go take at a step
-RAISED = 0.02  # [m] the palm rises by between two postures of a lift
+APART = 0.02  # [m] of the palm, at most, between two postures of a straight way
 
 
 def reach(
@@ -49,19 +49,17 @@ def reach(
     return None
 
 
-def lifted(robot: Robot, q: np.ndarray, height: float) -> list[np.ndarray] | None:
-    """Postures (n,) [rad] along which the arm raises the palm straight up by `height` [m].
+def carried(robot: Robot, q: np.ndarray, by: np.ndarray) -> list[np.ndarray] | None:
+    """Postures (n,) [rad] along which the arm moves the palm straight by `by` (3,) [m], world.
 
-    The hand keeps its joints, the palm its orientation; below 0 it is set down. None where the arm
-    cannot go all the way.
+    The hand keeps its joints, the palm its orientation. None where the arm cannot go all the way.
     """
     p_palm, R_palm = robot.palm(q)
     hand = [j for j in range(robot.n) if j not in robot.arm]
-    count = max(1, int(np.ceil(abs(height) / RAISED)))
+    count = max(1, int(np.ceil(np.linalg.norm(by) / APART)))
     way: list[np.ndarray] = []
     for share in np.arange(1, count + 1) / count:
-        up = np.array([0.0, 0.0, share * height])
-        found = reach(robot, way[-1] if way else q, p_palm + up, R_palm, hand)
+        found = reach(robot, way[-1] if way else q, p_palm + share * by, R_palm, hand)
         if found is None:
             return None
         way.append(found)

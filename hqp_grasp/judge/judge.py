@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from hqp_grasp.control.forces import Grip, equal_normal, equal_torque, normal_null_space
-from hqp_grasp.control.reach import lifted
+from hqp_grasp.control.reach import carried
 from hqp_grasp.errors import InputError, one_of, positive
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.judge.bench import Bench
@@ -129,7 +129,7 @@ class Judge:
         before = bench.height
         rise = 0.0
         if robot.arm:
-            way = lifted(robot, bench.told, self.lift)
+            way = carried(robot, bench.told, np.array([0.0, 0.0, self.lift]))
             if way is None:
                 return Judged(
                     False, 0.0, bench.touching().normal_force.sum(), reason="out of reach"

@@ -147,6 +147,11 @@ class PhysicalProbe:
         return readings
 
     @property
+    def time(self) -> float:
+        """Of the newest sample [s], on the driver's clock; −inf before the first."""
+        return self._clock
+
+    @property
     def _names(self) -> list[str]:
         return [point.name for point in self.robot.description.contact_points]
 
