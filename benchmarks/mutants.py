@@ -119,7 +119,7 @@ MUTANTS = (
     Mutant("touch/geometric.py:TOUCH", "1e-9", "1e-6", "touch"),
     # Trials of one number are alike in every study.
     Mutant(
-        "experiments/trial.py:Trial._begin", "Sequence(entropy)", "Sequence(entropy[-1:])", TRIAL
+        "experiments/trial.py:Trial.begin", "Sequence(entropy)", "Sequence(entropy[-1:])", TRIAL
     ),
     # A killed run leaves half a file.
     Mutant(

@@ -22,6 +22,7 @@ from hqp_grasp.world.statics import contact_jacobian, torque_limits, weight_torq
 
 COLD = HQP("daqp")  # the quickest from nothing; from a similar answer the active-set search is
 EDGES = 8  # of the pyramids, which keep 0.92 of the cones' friction in the worst direction
+ROUNDING = 1e-6  # [–] of a joint's torques, by which an answer may be beyond their limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,8 +300,9 @@ class Grip:
             balance,
             contact_jacobian(self.robot, grasp).T,
             # Where weight takes all that a motor has, contacts cannot count on it, nor hold it up.
-            np.minimum(low - weight, 0.0),
-            np.maximum(high - weight, 0.0),
+            # Nor can they count on more than a motor has where weight helps it.
+            np.clip(low - weight, low, 0.0),
+            np.clip(high - weight, 0.0, high),
         )
 
     def levels(self, felt: Felt) -> list[Level]:
@@ -333,9 +335,12 @@ class Grip:
                 None, None, None, reason=f"forces not certified: {why}", solution=solution
             )
         forces = solution.x[: 3 * grasp.k].reshape(-1, 3)
+        torque = felt.torque @ forces.ravel()
+        limited = np.clip(torque, felt.torque_lower, felt.torque_upper)
+        rounding = np.abs(limited - torque) < ROUNDING * (felt.torque_upper - felt.torque_lower)
         return Squeeze(
             forces,
-            _of_fingers(self.robot, felt.torque @ forces.ravel()),
+            _of_fingers(self.robot, np.where(rounding, limited, torque)),
             margin(forces, grasp.normals, self.friction),
             tuple(self._reports(felt, solution)),
             solution=solution,

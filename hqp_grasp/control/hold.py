@@ -10,7 +10,8 @@ from hqp_grasp.control.forces import Grip, Squeeze
 from hqp_grasp.errors import InputError, instance, whole
 from hqp_grasp.grasp import Grasp, Miss, Missed
 
-RESERVE = 0.5  # share of the friction believed in that a contact uses before the grip grows
+RESERVE = 0.5  # share of the friction believed in that the load uses of all contacts together,
+ALARM = 0.8  # or any one contact, before the grip grows
 GROWTH, RELAXING = 1.25, 0.97  # by which the grip grows, or becomes weaker, at a step, at most
 ROUNDING = 1e-3  # [N] that normal forces may fall short of what is asked by
 
@@ -24,7 +25,8 @@ class Press:
     squeeze: Squeeze  # the forces behind it, as last computed
     used: float = 0.0  # friction |t|/a that the contact nearest to slipping was felt to use
     load: float = 0.0  # [N] the contacts' net force on the object, upwards
-    blind: int = 0  # steps in a row that felt no grasp
+    blind: int = 0  # steps in a row that felt no grasp,
+    straining: int = 0  # or contacts near slipping that could not be pressed harder
     reason: str = ""  # why the object should be set down; empty while it is safe
 
 
@@ -32,11 +34,12 @@ class Press:
 class Hold:
     """Presses as its grip says, harder where contacts come near to slipping.
 
-    `step` is a pure function of what is felt and of the step before. The grip grows until no
-    contact uses more than RESERVE of the friction believed in, and relaxes slowly where none does,
-    never below `grip.force`. Where nothing is felt the last torques are kept. The object should be
-    set down, and `Press.reason` says so, where contacts near slipping cannot be pressed harder, and
-    where nothing was felt for `patience` steps.
+    `step` is a pure function of what is felt and of the step before. The grip grows until the load
+    uses no more than RESERVE of the friction believed in, and no contact more than ALARM of it; it
+    relaxes slowly where less is used, never below `grip.force`. Where nothing is felt the last
+    torques are kept. The object should be set down, and `Press.reason` says so, where for
+    `patience` steps nothing was felt, or contacts beyond the friction believed in could not be
+    pressed harder.
     """
 
     grip: Grip
@@ -54,9 +57,9 @@ class Hold:
         """
         if isinstance(felt, Missed):
             return self._blind(felt, last)
-        used, load = _friction_used(felt), _load(felt)
+        used, shared, load = _friction_used(felt)
         strength = self.grip.force if last is None else last.strength
-        growth = used / (RESERVE * self.grip.friction)
+        growth = max(shared / RESERVE, used / ALARM) / self.grip.friction
         wanted = strength * min(max(growth, RELAXING), GROWTH)
         wanted = min(max(wanted, self.grip.force), self.grip.most)
         warm = None if last is None else last.squeeze
@@ -65,13 +68,15 @@ class Hold:
             if last is None:
                 raise InputError(f"Hold: {squeeze.reason}")
             return replace(last, used=used, load=load, blind=0, reason=squeeze.reason)
-        reason = ""
-        if growth > 1.0 and used > self.grip.friction and not self._can_grow(squeeze, wanted):
+        straining, reason = 0, ""
+        if used > self.grip.friction and not self._can_grow(squeeze, wanted):
+            straining = 1 if last is None else last.straining + 1
+        if straining >= self.patience:
             reason = (
                 f"a contact uses friction of {used:.2f}, {self.grip.friction:g} is believed, and "
                 f"the hand cannot press harder than {wanted:.3g} N a contact"
             )
-        return Press(squeeze.torque, wanted, squeeze, used, load, 0, reason)
+        return Press(squeeze.torque, wanted, squeeze, used, load, 0, straining, reason)
 
     def _can_grow(self, squeeze: Squeeze, strength: float) -> bool:
         weak = any(r.law == "grip strength" and r.short > ROUNDING for r in squeeze.reports)
@@ -89,16 +94,16 @@ class Hold:
         return replace(last, blind=blind, reason=why if gone else last.reason)
 
 
-def _friction_used(grasp: Grasp) -> float:
-    """Largest |t_i|/a_i of the contacts; 0 where no wrench is felt."""
+def _friction_used(grasp: Grasp) -> tuple[float, float, float]:
+    """Of the forces felt: the largest |t_i|/a_i, |Σ f_i|/Σ a_i, and the net force upwards [N].
+
+    All are 0 where no wrench is felt.
+    """
     if any(contact.wrench is None for contact in grasp.contacts):
-        return 0.0
+        return 0.0, 0.0, 0.0
     f = np.array([contact.wrench[:3] for contact in grasp.contacts])  # type: ignore[index]
     a = (f * grasp.normals).sum(axis=1)
     t = np.linalg.norm(f - a[:, None] * grasp.normals, axis=1)
-    return float((t / np.maximum(a, np.finfo(float).tiny)).max())
-
-
-def _load(grasp: Grasp) -> float:
-    """Net force of the contacts on the object, upwards [N]; 0 where no wrench is felt."""
-    return -sum(float(c.wrench[2]) for c in grasp.contacts if c.wrench is not None)
+    least, net = np.finfo(float).tiny, f.sum(axis=0)
+    used, shared = (t / np.maximum(a, least)).max(), np.linalg.norm(net) / max(a.sum(), least)
+    return float(used), float(shared), -float(net[2])

@@ -14,17 +14,22 @@ from hqp_grasp.world.robot import Robot
 MAX_STEPS = 60
 STEP = 0.3  # [rad]
 TOLERANCE = 1e-4  # [m, rad]
-HOMING = 0.1  # [–] share of the way to home that joints which are free to go take at a step
+HOMING = 0.1  # [–]
 APART = 0.02  # [m] of the palm, at most, between two postures of a straight way
 
 
 def reach(
-    robot: Robot, q: np.ndarray, p_palm: np.ndarray, R_palm: np.ndarray, keep: Sequence[int]
+    robot: Robot,
+    q: np.ndarray,
+    p_palm: np.ndarray,
+    R_palm: np.ndarray,
+    keep: Sequence[int],
+    homing: float = HOMING,
 ) -> np.ndarray | None:
     """Joints (n,) [rad], from q (n,) on, that bring the palm to p (3,) [m], R (3, 3), world.
 
-    The joints `keep` stay; of the others those that the palm leaves free go home. None where the
-    arm cannot go there.
+    The joints `keep` stay; of the others those that the palm leaves free go home by the share
+    `homing` of the way at a step. None where the arm cannot go there.
     """
     hqp = HQP("active-set")
     free = np.array([j for j in range(robot.n) if j not in keep], dtype=int)
@@ -40,7 +45,7 @@ def reach(
             Level(one, lower, upper),
             Level.equal(one[list(keep)], np.zeros(len(keep))),
             Level.equal(robot.palm_jacobian(q), error),
-            Level.equal(one[free], HOMING * (robot.home - q)[free]),
+            Level.equal(one[free], homing * (robot.home - q)[free]),
         ]
         found = hqp.solve(levels)
         if not found.certified:
@@ -52,14 +57,16 @@ def reach(
 def carried(robot: Robot, q: np.ndarray, by: np.ndarray) -> list[np.ndarray] | None:
     """Postures (n,) [rad] along which the arm moves the palm straight by `by` (3,) [m], world.
 
-    The hand keeps its joints, the palm its orientation. None where the arm cannot go all the way.
+    The hand keeps its joints, the palm its orientation; an arm with joints to spare moves them as
+    little as it can. None where it cannot go all the way.
     """
     p_palm, R_palm = robot.palm(q)
     hand = [j for j in range(robot.n) if j not in robot.arm]
     count = max(1, int(np.ceil(np.linalg.norm(by) / APART)))
     way: list[np.ndarray] = []
     for share in np.arange(1, count + 1) / count:
-        found = reach(robot, way[-1] if way else q, p_palm + share * by, R_palm, hand)
+        start = way[-1] if way else q
+        found = reach(robot, start, p_palm + share * by, R_palm, hand, homing=0.0)
         if found is None:
             return None
         way.append(found)

@@ -24,9 +24,9 @@ STANDING = 1.0  # [s] held where it was lifted to, and weighed
 SHAKE, SHAKING = 0.01, 0.3  # [m] up and down, [s] each way
 SHAKES = 3
 NEAR = 0.008  # [m] above where it stood, from which it is set down slowly,
-FINE = 0.001  # [m] at a time,
+FINE, FINING = 0.001, 0.15  # [m] at a time, [s] each,
 FARTHER = 0.012  # [m] below, at most: what was held may have slipped
-STANDS = 0.2  # share of its weight still carried, below which it stands
+STANDS = 0.4  # share of its weight still carried, below which it stands
 RELEASING, OPENING = 0.6, 0.5  # [s] of pressing ever less, of opening
 
 
@@ -104,7 +104,7 @@ def lift(
         fine = [_raised(robot, grasp.q, rise) for rise in np.arange(NEAR - FINE, 0.0, -FINE)]
         most = max((m.press.load for m in looking.moments), default=0.0)
         for q in (*fine, grasp.q, *below):
-            looking.carry("lower", q, FINE / SPEED)
+            looking.carry("lower", q, FINING)
             stands = looking.press.blind == 0 and looking.press.load < STANDS * most
             if stands:
                 break

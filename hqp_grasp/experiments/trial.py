@@ -111,12 +111,12 @@ class Trial:
         """The record of a trial of which nothing is known but what ended it."""
         robot = self.scene.articulated
         rows = (self._empty(robot, Stack.of(self.stack)),) * (self.probes + 1)
-        return Record(_entropy(seed), rows, (), 0, robot.joints, error)
+        return Record(entropy_of(seed), rows, (), 0, robot.joints, error)
 
     def _run(
         self, seed: int | Sequence[int], probe: Probe | None
     ) -> tuple[Record, Exception | None]:
-        entropy = _entropy(seed)
+        entropy = entropy_of(seed)
         robot, stack = self.scene.articulated, Stack.of(self.stack)
         rows: list[dict[str, object]] = []
         history: list[Touch] = []
@@ -124,9 +124,9 @@ class Trial:
         # One failing trial must not cost the others of a study: whatever ended this one is told
         # in its record, with the rows so far.
         try:
-            began = self._begin(entropy, probe)
+            began = self.begin(entropy, probe)
             rejected = began.first.rejected
-            for row, touch in self._probe(began):
+            for row, touch in self.touches(began):
                 rows.append(row)
                 if touch is not None:
                     history.append(touch)
@@ -138,7 +138,8 @@ class Trial:
         record = Record(entropy, tuple(rows), grasps, rejected, robot.joints, ended)
         return record, failure
 
-    def _begin(self, entropy: tuple[int, ...], probe: Probe | None) -> _Began:
+    def begin(self, entropy: tuple[int, ...], probe: Probe | None = None) -> Began:
+        """The first touch, and the hand that made it."""
         if isinstance(self.start, Grasp):
             return self._touching(FirstTouch(self.scene, self.start, 0), entropy, probe)
         rng = np.random.default_rng(np.random.SeedSequence(entropy))
@@ -156,7 +157,7 @@ class Trial:
 
         return self._touching(self.start.draw(self.scene, same, rng), entropy, probe)
 
-    def _drawn(self, start: Start, entropy: tuple[int, ...], rng: np.random.Generator) -> _Began:
+    def _drawn(self, start: Start, entropy: tuple[int, ...], rng: np.random.Generator) -> Began:
         """A start found by geometry; where a simulated hand cannot hold it, the next one."""
         rejected, last = 0, ""
         physics = self.physics
@@ -176,14 +177,14 @@ class Trial:
             f"(the last: {last})"
         )
 
-    def _touching(self, first: FirstTouch, entropy: tuple[int, ...], probe: Probe | None) -> _Began:
+    def _touching(self, first: FirstTouch, entropy: tuple[int, ...], probe: Probe | None) -> Began:
         hand, touching = self._hand(first, entropy, probe)
         felt: Grasp | Missed = first.grasp
         if isinstance(touching, PhysicalProbe | NoisyProbe):
             felt = touching.touch(first.grasp.q)
-        return _Began(first, hand, touching, felt)
+        return Began(first, hand, touching, felt)
 
-    def _probe(self, began: _Began) -> Iterator[tuple[dict[str, object], Touch | None]]:
+    def touches(self, began: Began) -> Iterator[tuple[dict[str, object], Touch | None]]:
         """The row of every touch as it is made; the last, without a touch, tells of giving up."""
         scene, hand, touching = began.first.scene, began.hand, began.touching
         robot, controller, stack = scene.articulated, self.controller(scene), Stack.of(self.stack)
@@ -247,7 +248,7 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class _Began:
+class Began:
     """A trial after its first touch."""
 
     first: FirstTouch
@@ -289,7 +290,8 @@ def _about(step: Step) -> dict[str, object]:
     }
 
 
-def _entropy(seed: int | Sequence[int]) -> tuple[int, ...]:
+def entropy_of(seed: int | Sequence[int]) -> tuple[int, ...]:
+    """The whole numbers that seed a trial; raise InputError for what is none."""
     numbers: Sequence[int] = seed if isinstance(seed, Sequence) else (seed,)
     try:
         entropy = tuple(index(number) for number in numbers)

@@ -15,7 +15,15 @@ from hqp_grasp.touch.driver import PRESS_RATE, DriverLimits, Readings
 from hqp_grasp.touch.geometric import OVERLAP, RETREAT
 from hqp_grasp.world.imperfections import SensorErrors
 from hqp_grasp.world.objects import OBJECT
-from hqp_grasp.world.physics import NOSLIP, Physics, foot, round_tips, servos, simulated_model
+from hqp_grasp.world.physics import (
+    NOSLIP,
+    Physics,
+    foot,
+    palm_sensors,
+    round_tips,
+    servos,
+    simulated_model,
+)
 from hqp_grasp.world.scene import Scene
 
 SAMPLING = 0.01  # [s] between readings
@@ -50,6 +58,8 @@ class Truth:
     grasp: Grasp | None  # the true contacts; None unless every tip touches the object
     forces: np.ndarray  # (k, 3) [N] that the object applies to each tip, world
     R_world_tip: np.ndarray  # (k, 3, 3) where the tips really point
+    place: np.ndarray  # (7,) the object's [m] and quaternion, world
+    in_palm: np.ndarray  # (7,) the same, in the palm's frame; NaN for a fixed object
     moved: float  # [m] the object's middle, since the hand was placed
     turned: float  # [rad] the object
     other_links: tuple[str, ...]  # geoms beside the tips that touch the object
@@ -265,13 +275,17 @@ class SimulatedHand:
             ]
             grasp = self.robot.grasp(self._state[self._q], contacts, tuple(dict.fromkeys(links)))
         moved = turned = 0.0
+        place = np.concatenate([data.body(OBJECT).xpos, data.body(OBJECT).xquat])
+        in_palm = np.full(7, np.nan)
         if self._free:
+            in_palm = data.sensordata[palm_sensors(model)].copy()
             pose = data.joint(OBJECT).qpos
             start = model.qpos0[model.joint(OBJECT).qposadr[0] :][:7]
             moved = float(np.linalg.norm(pose[:3] - start[:3]))
             turned = float(2.0 * np.arccos(min(1.0, abs(pose[3:] @ start[3:]))))
         R = data.site_xmat[self._sites].reshape(-1, 3, 3).copy()
-        return Truth(grasp, forces, R, moved, turned, tuple(dict.fromkeys(links)), tuple(table))
+        others = tuple(dict.fromkeys(links))
+        return Truth(grasp, forces, R, place, in_palm, moved, turned, others, tuple(table))
 
     # ------------------------------------------------------------ the driver
 

@@ -396,7 +396,7 @@ def test_a_folder_of_other_settings_is_said_in_one_line(ran):
 @pytest.fixture
 def failing(monkeypatch):
     """Trial 1 ends in a SolverError at its first step."""
-    begin, step, trial = Trial._begin, Controller.step, [0]
+    begin, step, trial = Trial.begin, Controller.step, [0]
 
     def beginning(self, entropy, probe):
         trial[0] = entropy[-1]
@@ -407,7 +407,7 @@ def failing(monkeypatch):
             raise SolverError("no method found an answer")
         return step(self, history)
 
-    monkeypatch.setattr(Trial, "_begin", beginning)
+    monkeypatch.setattr(Trial, "begin", beginning)
     monkeypatch.setattr(Controller, "step", raising)
 
 

@@ -248,7 +248,7 @@ def test_an_interrupt_while_writing_leaves_no_broken_trial(monkeypatch, done, st
 @pytest.fixture
 def failing(monkeypatch):
     """Trials that fail from here on, at their second step."""
-    numbers, step, begin, trial = set(), Controller.step, Trial._begin, [0]
+    numbers, step, begin, trial = set(), Controller.step, Trial.begin, [0]
 
     def beginning(self, entropy, probe):
         trial[0] = entropy[-1]
@@ -259,7 +259,7 @@ def failing(monkeypatch):
             raise SolverError(f"no answer in trial {trial[0]}")
         return step(self, history)
 
-    monkeypatch.setattr(Trial, "_begin", beginning)
+    monkeypatch.setattr(Trial, "begin", beginning)
     monkeypatch.setattr(Controller, "step", raising)
     return numbers
 
@@ -339,14 +339,14 @@ def test_every_worker_has_one_blas_thread(trial, tmp_path, monkeypatch):
 @pytest.fixture
 def starting(monkeypatch):
     """Trials of which these find no start, from here on."""
-    numbers, begin = set(), Trial._begin
+    numbers, begin = set(), Trial.begin
 
     def beginning(self, entropy, probe):
         if entropy[-1] in numbers:
             raise ReachError("out of reach; move the object")
         return begin(self, entropy, probe)
 
-    monkeypatch.setattr(Trial, "_begin", beginning)
+    monkeypatch.setattr(Trial, "begin", beginning)
     return numbers
 
 
