@@ -25,6 +25,9 @@ SUPPORT = "support"  # the geom that a free object stands on
 # Iterations of MuJoCo's solver without slip, for what is held: with none it creeps by 0.5 mm/s. But
 # what only stands shakes on its support with them: a touched one moves four times as far.
 NOSLIP = 2
+# By MuJoCo's own tolerance, 1e-8, its solver ends early now and then while a hand grips, and all
+# contact forces vanish for a step: with this one that was not seen.
+SOLVED = 1e-10
 SPIN_FRICTION = 0.02  # [m] torque about the normal that a contact transmits, by normal force
 
 
@@ -142,6 +145,7 @@ def _set_options(spec: mujoco.MjSpec, physics: Physics) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
+    spec.option.tolerance = SOLVED
 
 
 def _compensate(spec: mujoco.MjSpec, share: float) -> None:

@@ -210,8 +210,9 @@ def test_a_weak_motor_costs_strength_and_the_report_says_so():
     robot.model.actuator_forcerange[:] = [-0.5 * most, 0.5 * most]
     weak = hg.Grip(robot).solve(grasp)
     assert short(weak, "grip strength") > 0.1 and short(weak, "joint torques") == 0.0
-    held = weak.torque + weight_torque(robot, grasp.q)
-    assert np.abs(held).max() == pytest.approx(0.5 * most, abs=SMALL)
+    alone, held = weak.torque, weak.torque + weight_torque(robot, grasp.q)
+    used = np.maximum(np.abs(alone), np.abs(held))  # weight may not help beyond what a motor has
+    assert used.max() == pytest.approx(0.5 * most, abs=SMALL)
 
 
 def test_a_motor_whose_weight_takes_all_has_nothing_left_for_contacts(robot):
