@@ -39,6 +39,9 @@ class Contact:
 
     Everything after `normal` is optional: a law that needs it says so. A contact belongs to a
     body, not to a finger: any link of any robot can hold one.
+
+    A link that is no ball may lie along the object. As it turns by ω [rad] its touch then runs
+    along it, by `stretch` (ω × n) beyond what a ball of `tip_radius` rolls.
     """
 
     position: np.ndarray  # (3,) [m], world
@@ -48,6 +51,7 @@ class Contact:
     point: np.ndarray | None = None  # (3,) [m], body frame: the point whose motion `jacobian` gives
     flexion: tuple[int, ...] = ()  # γ_i: indices into q of the joints that press this contact
     tip_radius: float = 0.0  # [m] from `point` to the touching surface; 0 for a material point
+    stretch: np.ndarray | None = None  # (3, 3) [m/rad], world; None on a ball
     wrench: np.ndarray | None = None  # (6,) force [N], torque [N·m] on the tip, when sensed
     noise: float = 0.0  # [rad] standard error of `normal` about each axis across it, when sensed
 
@@ -61,6 +65,8 @@ class Contact:
         set_field(self, "normal", normal)
         if self.point is not None:
             set_field(self, "point", as_array("Contact.point", self.point, (3,)))
+        if self.stretch is not None:
+            set_field(self, "stretch", as_array("Contact.stretch", self.stretch, (3, 3)))
         if self.wrench is not None:
             set_field(self, "wrench", as_array("Contact.wrench", self.wrench, (6,)))
         try:
@@ -77,19 +83,23 @@ class Contact:
 class Grasp:
     """A hand posture and the k contacts felt there.
 
-    `jacobian` stacks ∂x_i/∂q over the contacts (paper, eq. 12); `hessian[a, j, l]` is
-    ∂²x_a/∂q_j∂q_l of the same 3k coordinates. x_i is the point whose motion carries contact i:
-    for a round fingertip the centre of the sphere, `tip_radius` away from the touching surface.
+    `jacobian` stacks ∂x_i/∂q over the contacts (paper, eq. 12). x_i is the point whose motion
+    carries contact i: for a round fingertip the centre of the sphere, `tip_radius` away from the
+    touching surface. Where contacts have a `stretch`, `rolling` is what of `jacobian` comes of it,
+    and the rest is the motion of x_i as a point of its link; `hessian[a, j, l]` is ∂²x_a/∂q_j∂q_l
+    of these points' 3k coordinates.
     """
 
     q: np.ndarray  # (n,) independent joints [rad]
     contacts: tuple[Contact, ...]  # k of them
     jacobian: np.ndarray  # (3k, n) [m/rad], world
     hessian: np.ndarray | None = None  # (3k, n, n) [m/rad²], world
+    rolling: np.ndarray | None = None  # (3k, n) [m/rad], world; None where no contact has a stretch
     coupling: np.ndarray | None = None  # C (N, n): q_full = C q + c₀; identity when None
     offset: np.ndarray | None = None  # c₀ (N,); zero when None
     other_links: tuple[str, ...] = ()  # geoms beside the contact points that touch the object
     _J3: np.ndarray = field(init=False, repr=False)  # (k, 3, n) view of jacobian
+    _of_links: np.ndarray = field(init=False, repr=False)  # (k, 3, n) the same without rolling
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -122,6 +132,10 @@ class Grasp:
         set_field(self, "contacts", contacts)
         set_field(self, "jacobian", jacobian)
         set_field(self, "_J3", jacobian.reshape(k, 3, n))
+        set_field(self, "_of_links", self._J3)
+        if self.rolling is not None:
+            set_field(self, "rolling", as_array("Grasp.rolling", self.rolling, (3 * k, n)))
+            set_field(self, "_of_links", self._J3 - self.rolling.reshape(k, 3, n))
 
     @property
     def k(self) -> int:

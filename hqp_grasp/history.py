@@ -13,7 +13,7 @@ from hqp_grasp.files import whole_file
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 
 FORMER = ("confidence",)  # of contacts in older files; nothing ever read it
-GRASP = ("q", "jacobian", "hessian", "coupling", "offset")
+GRASP = ("q", "jacobian", "hessian", "rolling", "coupling", "offset")
 
 
 def save_history(path: str | Path, history: Sequence[Touch]) -> None:

@@ -21,19 +21,19 @@ def land(robot: Robot, stack: Stack, grasp: Grasp, x: np.ndarray) -> np.ndarray:
     A correction that is not certified is not made: the x before it keeps the limits.
     """
     limits = stack.limit_levels(grasp)
-    points = robot.points(grasp)
-    goal = robot.centers(grasp.q, points).ravel() + grasp.jacobian @ x
+    goal = robot.carried(grasp, grasp.q)[0] + grasp.jacobian @ x
     damping = LANDING_DAMPING * np.eye(grasp.n)
     hqp = HQP("active-set")
     for _ in range(LANDING_STEPS):
-        rest = goal - robot.centers(grasp.q + x, points).ravel()
+        there, J = robot.carried(grasp, grasp.q + x)
+        rest = goal - there
         if np.abs(rest).max() < LANDED:
             break
         levels = [
             Level(v.A, np.minimum(v.lower - v.A @ x, 0.0), np.maximum(v.upper - v.A @ x, 0.0))
             for v in limits
         ]
-        A = np.concatenate([robot.jacobian(grasp.q + x, points), damping])
+        A = np.concatenate([J, damping])
         b = np.concatenate([rest, np.zeros(grasp.n)])
         correction = hqp.solve([*levels, Level.equal(A, b, "landing")])
         if not correction.certified:

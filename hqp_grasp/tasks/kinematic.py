@@ -30,7 +30,8 @@ class KinematicTask(Task):
       opposite: the flexion turns tangent to the surface.
 
     `potential` is their sum ε_c and `gradient` its slope (paper, eq. 8–9). As in eq. 9 the contact
-    is a point of the hand, and its normal is held fixed.
+    is a point of the hand, and its normal is held fixed: a touch that runs along its link as the
+    link turns (`Grasp.rolling`) presses no harder for it.
 
     - form="gradient", the default: the paper's dq_c ∝ −∂ε_c/∂q as a level of n rows,
       x = −gain·∂ε_c/∂q. It fixes every joint, so nothing below it is felt. Here gain has the unit
@@ -116,7 +117,7 @@ class KinematicTask(Task):
         """ε (k,) and ∂ε/∂J_γᵀ (k, g, 3)."""
         # J_γᵀ of every contact (k, g, 3). A repeated index pads γ_i; its row is set to zero,
         # which changes neither error, and makes its slope zero too.
-        JT = grasp._J3[np.arange(grasp.k)[:, None], :, gamma]
+        JT = grasp._of_links[np.arange(grasp.k)[:, None], :, gamma]
         if gamma.shape[1] > 1:
             JT[:, 1:][gamma[:, 1:] == gamma[:, :-1]] = 0.0
         if self.kind == "eq7":

@@ -15,7 +15,7 @@ import numpy as np
 from hqp_grasp.errors import InputError, instance, one_of
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
 from hqp_grasp.world.objects import OBJECT
-from hqp_grasp.world.robot import CAPSULE, SPHERE
+from hqp_grasp.world.robot import CAPSULE, CYLINDER, SPHERE
 from hqp_grasp.world.scene import Scene
 
 RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves
@@ -26,8 +26,10 @@ OVERLAP = 1e-7  # [m] a link this deep in the object touches it
 NEAR = 5e-3  # [m] gap below which Newton's method finds the touch
 MAX_CLOSING_STEPS = 2000  # tens, but for tips that graze
 # [rad] over which the place of a touch is averaged on a link that is no ball; a flat on a cylinder
-# of 50 mm then touches within 5 mm of where it is tangent, and no end farther off counts.
+# of 50 mm then touches within 5 mm of where it is tangent, and no end farther off counts; and
+# where a capsule of 40 mm lies along the object its touch moves by 3.5 mm a degree.
 TILT = 0.1
+ON_SIDE = 0.7  # [–] cosine of the normal to a cylinder's axis, below which its side touches
 FAR = 2e-2  # [m] beyond this from the object a finger does not aim at it
 CLEAR = 2e-3  # [m] a link is lifted by to be tilted free of the object
 POSTURES = 10  # of a move, at each of which links may meet the object
@@ -279,42 +281,57 @@ class GeometricProbe:
             normal = away / math.sqrt(away @ away)
             return _Near(gap, centre - radius * normal, normal, radius)
         away = (link - thing) * (1.0 if gap > 0.0 else -1.0)
-        return _Near(gap, link, away / np.linalg.norm(away), 0.0)
+        normal = away / np.linalg.norm(away)
+        on_side = kind == CYLINDER and abs(normal @ data.geom_xmat[geom][2::3]) < ON_SIDE
+        return _Near(gap, link, normal, float(model.geom_size[geom, 0]) if on_side else 0.0)
 
-    def _patch(self, i: int, near: _Near) -> tuple[np.ndarray, float]:
-        """Middle of the touching patch (3,) [m], world, and the radius it is rounded by [m].
+    def _patch(self, i: int, near: _Near) -> Contact:
+        """The contact of a link that is no ball: at the middle of its touching patch.
 
         A flat touches at the end that its least tilt chooses: the nearest point jumps by the
         flat's length as that tilt changes sign. Its mean over tilts of ±TILT about each tangent
         moves steadily. Since the gap's derivative with the tilt is the nearest point's place, that
-        mean is (gap(+TILT) − gap(−TILT))/2 TILT; the radius is minus the second derivative.
+        mean is (gap(+TILT) − gap(−TILT))/2 TILT.
+
+        As the link turns by ω the middle runs along it by M (ω × n), with M (2, 2) in the tangents
+        and its columns (place(−TILT) − place(+TILT))/2 TILT. A ball's M is its radius. A capsule's
+        is that across, where the object's own edges may make it seem less, and up to its
+        length/2 TILT more along its axis. Of what is not round half the trace is the radius.
         """
         data = self._data
         geoms = list(self.scene.articulated.geoms[i])
         pose = data.geom_xpos[geoms].copy(), data.geom_xmat[geoms].copy()
-        middle, radius = near.link.copy(), 0.0
+        middle, M = near.link.copy(), np.zeros((2, 2))
         one = np.cross(near.normal, np.eye(3)[np.abs(near.normal).argmin()])
         one /= np.linalg.norm(one)
-        for tangent in (one, np.cross(near.normal, one)):
-            gaps = []
+        tangents = np.array([one, np.cross(near.normal, one)])
+        lifted = near.link + CLEAR * near.normal
+        for column, tangent in zip(M.T, tangents, strict=True):
+            gaps, places = [], []
             for angle in (TILT, -TILT):
                 R = _rotation(np.cross(tangent, near.normal), angle)
-                lifted = near.link + CLEAR * near.normal
                 data.geom_xpos[geoms] = (pose[0] - near.link) @ R.T + lifted
                 data.geom_xmat[geoms] = (R @ pose[1].reshape(-1, 3, 3)).reshape(-1, 9)
-                gaps.append(min(self._distance(g, REACH) for g in geoms))
+                there = self._nearest(i)
+                gaps.append(there.gap)
+                places.append(tangents @ R.T @ (there.link - lifted))
             middle += (gaps[0] - gaps[1]) / (2.0 * np.sin(TILT)) * tangent
-            radius += max(0.0, near.gap + CLEAR - sum(gaps) / 2.0) / TILT**2  # mean of two
+            column += (places[1] - places[0]) / (2.0 * np.sin(TILT))
         data.geom_xpos[geoms], data.geom_xmat[geoms] = pose
-        return middle, near.radius if near.radius > 0.0 else radius
+        runs, axes = np.linalg.eigh(0.5 * (M + M.T))
+        radius = near.radius if near.radius > 0.0 else max(0.0, 0.5 * float(runs.sum()))
+        beyond = np.maximum(runs, near.radius) - radius
+        across = axes.T @ tangents
+        stretch = (across.T * beyond) @ across
+        return Contact(middle, near.normal, tip_radius=radius, stretch=stretch)
 
     def _grasp(self, q: np.ndarray, others: tuple[str, ...]) -> Grasp:
         robot = self.scene.articulated
         contacts = []
         for i, ball in enumerate(self._round):
             near = self._nearest(i)
-            place, radius = (near.link, near.radius) if ball else self._patch(i, near)
-            contacts.append(Contact(place, near.normal, tip_radius=radius))
+            felt = Contact(near.link, near.normal, tip_radius=near.radius)
+            contacts.append(felt if ball else self._patch(i, near))
         return robot.grasp(q, contacts, others)
 
 

@@ -24,9 +24,9 @@ from hqp_grasp.world.description import (
 )
 
 SPHERE, CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-CONVEX = [SPHERE, CAPSULE] + [
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"))
-    for kind in ("ELLIPSOID", "CYLINDER", "BOX", "MESH")
+CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+CONVEX = [SPHERE, CAPSULE, CYLINDER] + [
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("ELLIPSOID", "BOX", "MESH")
 ]
 LINKS = {  # equalities of two links, and what they do
     int(mujoco.mjtEq.mjEQ_CONNECT): "closes a loop of links",
@@ -400,11 +400,35 @@ class Robot:
         """Centres of the contact points, or `points` of their links (k, 3) [m], world."""
         return self._world(self._at(q), points)
 
-    def points(self, grasp: Grasp) -> np.ndarray:
-        """The places on the links (k, 3) [m] whose motion the grasp's Jacobian gives."""
-        if any(contact.point is None for contact in grasp.contacts):
-            return self._points
-        return np.array([contact.point for contact in grasp.contacts])
+    def carried(self, grasp: Grasp, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where joints q (n,) carry the grasp's contacts: x (3k,) [m], world, and ∂x/∂q (3k, n).
+
+        x_i are the contacts' points, moved on by what links turn along their stretches. At the
+        grasp's own q, ∂x/∂q is its Jacobian.
+        """
+        points = self._points
+        if all(contact.point is not None for contact in grasp.contacts):
+            points = np.array([contact.point for contact in grasp.contacts])
+        x, J = self.centers(q, points), self.jacobian(q, points)
+        if grasp.rolling is not None:
+            stretch, deeper = self._stretched(grasp.q, grasp.contacts, points)
+            turned = self.centers(q, deeper) - x - grasp.normals
+            x = x + (stretch @ turned[:, :, None])[:, :, 0]
+            J = J + _times(stretch, self.jacobian(q, deeper) - J)
+        return x.ravel(), J
+
+    def _stretched(
+        self, q: np.ndarray, contacts: Sequence[Contact], points: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The contacts' stretches (k, 3, 3) [m/rad], and what tells ω × n of their links.
+
+        That are places (k, 3) in the links' frames, deeper than the points by the unit normal: as
+        links turn they move on from the points by ω × n.
+        """
+        none = np.zeros((3, 3))
+        stretch = np.array([none if c.stretch is None else c.stretch for c in contacts])
+        deeper = self.centers(q, points) + [c.normal for c in contacts]
+        return stretch, np.array([self.on_link(q, i, x) for i, x in enumerate(deeper)])
 
     def on_link(self, q: np.ndarray, i: int, x: np.ndarray) -> np.ndarray:
         """A place x (3,) [m], world, in the frame of contact point i's link."""
@@ -470,9 +494,9 @@ class Robot:
 
         `contacts` has one Contact for each contact point, in the description's order: position and
         outward normal (world), perhaps wrench and noise; on a link that is no ball,
-        perhaps the `tip_radius` it is rounded by there. Name, link, point and flexion are the
-        robot's, and so are the grasp's Jacobian, Hessian and coupling; and the position too on a
-        ball felt with noise, for joint angles tell its centre.
+        perhaps the `tip_radius` it is rounded by there, and its `stretch`. Name, link, point and
+        flexion are the robot's, and so are the grasp's Jacobian, Hessian and coupling; and the
+        position too on a ball felt with noise, for joint angles tell its centre.
         """
         q = self.require_q("Robot.grasp: q", q)
         points = self.description.contact_points
@@ -500,11 +524,17 @@ class Robot:
                     tip_radius=radius,
                 )
             )
+        J, rolling = self.jacobian(q, places), None
+        if any(c.stretch is not None for c in complete):
+            stretch, deeper = self._stretched(q, complete, places)
+            rolling = _times(stretch, self.jacobian(q, deeper) - J)
+            J = J + rolling
         return Grasp(
             q=q,
             contacts=tuple(complete),
-            jacobian=self.jacobian(q, places),
+            jacobian=J,
             hessian=self.hessian(q, places),
+            rolling=rolling,
             coupling=self.coupling,
             offset=self.offset,
             other_links=other_links,
@@ -534,6 +564,11 @@ class Robot:
                 f"{name} must be {self.n} finite angles, for {', '.join(self.joints)}; got {q!r}"
             )
         return array
+
+
+def _times(blocks: np.ndarray, J: np.ndarray) -> np.ndarray:
+    """Blocks (k, 3, 3), one a contact, times its three rows of J (3k, n)."""
+    return np.asarray((blocks @ J.reshape(len(blocks), 3, -1)).reshape(J.shape))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

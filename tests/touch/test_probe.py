@@ -1,6 +1,8 @@
 """Touching: where the tips end up, that nothing was touched before, and every way to miss."""
 
 import pickle
+from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,7 +13,9 @@ from tiny_hand import LENGTH, STIFF, TIP, TOML, change
 
 from hqp_grasp.control.limits import StepLimit
 from hqp_grasp.errors import InputError
+from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Grasp, Miss, Missed
+from hqp_grasp.tasks import KinematicTask, stack_of
 from hqp_grasp.touch.geometric import RETREAT, GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
@@ -19,6 +23,7 @@ SURFACE_TOL = 1e-7  # [m]
 NORMAL_TOL = 1e-6
 AGAIN_TOL = 1e-7  # [rad]
 EXACT = 1e-12
+HANDS = Path(__file__).parents[2] / "benchmarks" / "robots"
 TALL = 0.4  # [m] so that only the sides are met
 OBJECTS = {"cylinder": Cylinder(0.05, TALL), "hexagon": Prism.regular(6, 0.05, TALL)}
 POSTURES = (  # [rad] from which every finger touches either object
@@ -242,6 +247,106 @@ def test_a_flat_touches_a_round_object_where_it_is_tangent(tmp_path):
     contact = grasp.contacts[0]
     on_surface = np.array(scene.position) + radius * contact.normal
     np.testing.assert_allclose(contact.position[:2], on_surface[:2], atol=5e-4)
+
+
+TIPS = {
+    "capsule": 'type="capsule" size="0.009 0.019"',
+    "cylinder": 'type="cylinder" size="0.009 0.019"',
+    "box": 'type="box" size="0.006 0.008 0.019"',
+    "ellipsoid": 'type="ellipsoid" size="0.006 0.008 0.019"',
+}
+SWAY = 5e-4  # [rad, m]
+SECOND_ORDER = 0.02  # [–] share of a motion so small that its square may bring
+PLACE_TOL = 1e-5  # [m] of a touch whose gap is not quite nothing
+
+
+def before_a_wall(folder, tip):
+    """A hand of one finger beside a wall that it closes onto, free to move and turn."""
+    axes = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+    arm = {f"{kind}_{a}": (kind, axis) for kind in ("slide", "hinge") for a, axis in axes.items()}
+    joints = "".join(
+        f'<joint name="{name}" type="{kind}" axis="{axis}" range="-1 1"/>'
+        for name, (kind, axis) in arm.items()
+    )
+    (folder / "hook.xml").write_text(
+        f"""<mujoco><compiler angle="radian"/><worldbody>
+        <body name="palm">{joints}<geom type="sphere" size="0.005"/>
+        <body name="finger"><joint name="finger" axis="0 -1 0" range="-1 1"/>
+        <geom {tip} pos="0 0 0.1"/></body></body></worldbody></mujoco>"""
+    )
+    (folder / "hook.toml").write_text(
+        f"""model = "hook.xml"
+        arm = {list(arm)}
+        palm = {{ body = "palm", pos = [0, 0, 0], approach = [0, 0, 1], opposition = [1, 0, 0] }}
+        contact_points = [{{ link = "finger", flexion = {{ finger = 1 }} }}]"""
+    )
+    wall = Prism(((0.1, 0.2), (-0.1, 0.2), (-0.1, -0.2), (0.1, -0.2)), 0.6)
+    return Scene(folder / "hook.toml", wall, (-0.11, 0.0, 0.1))
+
+
+@pytest.mark.parametrize("tip", TIPS)
+def test_a_touch_moves_along_a_link_as_its_grasp_says(tmp_path, tip):
+    """Where a link lies along the object a little tilt moves its touch by much, but steadily."""
+    scene = before_a_wall(tmp_path, TIPS[tip])
+    robot, probe = scene.articulated, GeometricProbe(scene)
+    first = probe.touch(np.zeros(7))
+    assert isinstance(first, Grasp), first
+    along = np.eye(3) - np.outer(first.normals[0], first.normals[0])
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        second = probe.touch(first.q + SWAY * rng.normal(size=robot.n))
+        assert isinstance(second, Grasp)
+        predicted = along @ first.jacobian @ (second.q - first.q)
+        moved = along @ (second.positions - first.positions)[0]
+        assert np.linalg.norm(predicted) > 0.1 * SWAY
+        np.testing.assert_allclose(
+            moved, predicted, rtol=0.0, atol=PLACE_TOL + SECOND_ORDER * np.linalg.norm(predicted)
+        )
+
+
+@pytest.mark.parametrize("tip", TIPS)
+def test_the_robot_carries_a_touch_as_its_grasp_says(tmp_path, tip):
+    """`carried` is where landing takes the tips to be, and what the kinematic law presses."""
+    scene = before_a_wall(tmp_path, TIPS[tip])
+    robot = scene.articulated
+    grasp = GeometricProbe(scene).touch(np.zeros(7))
+    contact, step = grasp.contacts[0], 1e-6
+    x, J = robot.carried(grasp, grasp.q)
+    center = contact.position + contact.tip_radius * contact.normal
+    np.testing.assert_allclose(x, center, atol=EXACT)
+    np.testing.assert_allclose(J, grasp.jacobian, atol=EXACT)
+    there = [[robot.carried(grasp, grasp.q + s * e)[0] for s in (step, -step)] for e in np.eye(7)]
+    slopes = [(ahead - behind) / (2.0 * step) for ahead, behind in there]
+    np.testing.assert_allclose(np.transpose(slopes), J, atol=1e-7)
+    of_link = robot.jacobian(grasp.q, contact.point[None])
+    np.testing.assert_allclose(grasp.jacobian - grasp.rolling, of_link, atol=EXACT)
+    law = KinematicTask()
+    pressed = replace(grasp, jacobian=of_link, rolling=None)
+    np.testing.assert_allclose(law.error(grasp), law.error(pressed), atol=EXACT)
+
+
+def test_a_capsule_rolls_as_a_ball_across_and_by_its_length_along(tmp_path):
+    scene = before_a_wall(tmp_path, TIPS["capsule"])
+    (contact,) = GeometricProbe(scene).touch(np.zeros(7)).contacts
+    assert contact.tip_radius == 0.009
+    # Tilted by 0.1 rad either way it touches at its ends.
+    expected = np.zeros((3, 3))
+    expected[2, 2] = 0.019 / np.sin(0.1)
+    np.testing.assert_allclose(contact.stretch, expected, atol=1e-4)
+
+
+def test_a_ball_has_no_stretch(world):
+    for grasp in world.grasps:
+        assert grasp.rolling is None
+        assert all(contact.stretch is None for contact in grasp.contacts)
+
+
+@pytest.mark.parametrize("hand", ["capsules", "boxes"])
+def test_tips_that_are_no_balls_come_to_balance(hand):
+    """Where nothing tells how touches run along capsules, forces and moments jump about."""
+    scene = Scene(HANDS / f"{hand}.toml", Cylinder(0.05))
+    trial = Trial(scene, stack_of("fmk"), probes=20)
+    assert [trial.run((41, i)).verdict for i in range(2)] == ["good"] * 2
 
 
 def test_a_face_is_met_flat(tmp_path):
