@@ -213,7 +213,7 @@ class GeometricProbe:
             place(s, moving)
             for i in moving:
                 gaps[i] = self._gap(i)
-                if gaps[i] < 0.0:
+                if gaps[i] < (0.0 if self._round[i] else CLOSE[0]):  # past the touch
                     inside[i] = min(inside[i], s[i])
                 else:
                     free[i] = max(free[i], s[i])

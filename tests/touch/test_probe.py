@@ -305,6 +305,15 @@ def test_a_touch_moves_along_a_link_as_its_grasp_says(tmp_path, tip):
 
 
 @pytest.mark.parametrize("tip", TIPS)
+def test_a_link_that_lies_along_the_object_is_felt_wherever_it_comes_from(tmp_path, tip):
+    """Also where closing first comes nearer than the gap that counts as a touch, but not inside."""
+    scene = before_a_wall(tmp_path, TIPS[tip])
+    probe, rng = GeometricProbe(scene), np.random.default_rng(0)
+    touches = [probe.touch(SWAY * rng.normal(size=7)) for _ in range(60)]
+    assert [felt for felt in touches if isinstance(felt, Missed)] == []
+
+
+@pytest.mark.parametrize("tip", TIPS)
 def test_the_robot_carries_a_touch_as_its_grasp_says(tmp_path, tip):
     """`carried` is where landing takes the tips to be, and what the kinematic law presses."""
     scene = before_a_wall(tmp_path, TIPS[tip])
