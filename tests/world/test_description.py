@@ -949,7 +949,7 @@ def test_a_flat_touches_in_its_middle_whichever_way_it_tilts(tmp_path):
         probe = GeometricProbe(scene, links="pass")
         scene.articulated.place(probe._data, np.zeros(2))
         near = probe._nearest(0)
-        places.append((near.link[2], probe._patch(0, near)[0][2]))
+        places.append((near.link[2], probe._patch(0, near).position[2]))
     (low, middle), (high, other) = places
     assert abs(low - high) > 0.03
     assert abs(middle - 0.1) < 1e-3 and abs(other - 0.1) < 1e-3
