@@ -12,6 +12,8 @@ from hqp_grasp.__main__ import main
 
 
 def call(monkeypatch, *arguments):
+    for name in [name for name in sys.modules if name.startswith("hqp_grasp.scenarios.")]:
+        monkeypatch.delitem(sys.modules, name)  # as in a process of its own
     monkeypatch.setattr(sys, "argv", ["hqp_grasp", *map(str, arguments)])
     main()
 
