@@ -132,6 +132,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,probing,benchmarks/probing.py)
 	$(call keep,probing-joints,benchmarks/probing.py --robots bhand wam_bhand umass_torso --joints 8 16 24 32 40)
 	$(call keep,short-of-joints,benchmarks/short_of_joints.py --configurations 2000 --seed 0)
+	$(call keep,tips,benchmarks/tips.py --trials 20 --seed 906)
 	$(call keep,limits,benchmarks/limits.py)
 	$(call keep,limits-6,benchmarks/limits.py --trials 6)
 	$(call keep,equivalence-0,benchmarks/equivalence.py --trials 4 --probes 30)

@@ -123,6 +123,21 @@ def test_what_a_page_shows_runs_and_prints_what_the_page_says(page, tmp_path, mo
         call(arguments, monkeypatch)
 
 
+@pytest.mark.parametrize("seed", [2, 3])
+def test_the_hand_that_a_page_describes_comes_to_balance(seed, tmp_path):
+    """From other starts than the one whose verdict the page prints."""
+    for _, file, code, _ in BLOCKS["any-robot.md"]:
+        if file:
+            (tmp_path / file).write_text(code, encoding="utf-8")
+    (robot,) = tmp_path.glob("*.toml")
+    scene = hg.Scene(robot, hg.Cylinder(radius=0.05))
+    assert hg.Trial(scene, hg.stack_of("fmk"), probes=20).run(seed).verdict == "good"
+
+
+def test_no_page_takes_a_trial_that_is_not_lost_for_a_success():
+    assert [page for page in BLOCKS if any(".lost" in code for _, _, code, _ in BLOCKS[page])] == []
+
+
 @pytest.mark.parametrize("page", BLOCKS)
 def test_make_knows_what_a_page_has_it_make(page):
     found = [w for kind, _, code, _ in BLOCKS[page] if kind == "sh" for w in commands(code)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from hqp_grasp.errors import one_of
 from hqp_grasp.files import whole_file
+from hqp_grasp.touch.geometric import TILT
 from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.description import CARRIAGE, RobotDescription
 from hqp_grasp.world.robot import CAPSULE, CENTRED, SPHERE, Robot, compiled, described
@@ -182,13 +183,20 @@ def _spread(x: np.ndarray) -> float:
 
 
 def _shape(model: mujoco.MjModel, geom: int) -> str:
+    """What a geom is, and what is to be expected of a tip of this shape."""
     kind = int(model.geom_type[geom])
+    radius = f"{1e3 * model.geom_size[geom, 0]:.3g} mm"
     if kind == SPHERE:
-        return f"ball of {1e3 * model.geom_size[geom, 0]:.3g} mm"
+        return f"ball of {radius} (touches at a point)"
+    half = float(model.geom_size[geom, 1] if kind == CAPSULE else model.geom_aabb[geom, 3:].max())
+    runs = f"{1e3 * np.radians(half / TILT):.2g} mm for each degree that it turns"
     if kind == CAPSULE:
-        return f"capsule of {1e3 * model.geom_size[geom, 0]:.3g} mm"
+        return (
+            f"capsule of {radius} (touches as a ball at its ends; laid along the object it counts "
+            f"by the middle of its touch, which runs along it by up to {runs})"
+        )
     name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
-    return f"{name} (its touching patch counts by its middle)"
+    return f"{name} (its touching patch counts by its middle, which runs along it by up to {runs})"
 
 
 def _link(robot: Robot, i: int) -> str:
