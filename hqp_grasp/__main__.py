@@ -13,9 +13,12 @@ from tyro.extras import SubcommandApp
 import hqp_grasp.scenarios
 from hqp_grasp.errors import HqpGraspError, one_of
 from hqp_grasp.experiments import report as reports
+from hqp_grasp.experiments.judging import Judging, judge_folder, summary
 from hqp_grasp.experiments.plain import speak_plainly
 from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.experiments.view import HOST, PORT, serve
+from hqp_grasp.judge.judge import Judge
+from hqp_grasp.world.scene import Scene
 
 app = SubcommandApp()
 
@@ -41,6 +44,45 @@ def report(folders: Positional[tuple[Path, ...]], /) -> None:
         folders: Where scenarios left their results.
     """
     print(reports.report(folders))
+
+
+@app.command
+def judge(
+    folder: Positional[Path],
+    /,
+    squeeze: tuple[str, ...] = ("hierarchy",),
+    protocol: tuple[str, ...] = ("pulls",),
+    force: float = 5.0,
+    mass: float = 0.1,
+    friction: float = 0.6,
+    believed: float = 0.5,
+    probe: int | None = None,
+    jobs: int = 2,
+    cluster: str | None = None,
+) -> None:
+    """Judge the grasps of a results folder: free the object, squeeze, lift, pull until it slips.
+
+    Writes DIR/judged.parquet, one row for each trial, squeeze and protocol.
+
+    Args:
+        folder: Where a scenario left its results.
+        squeeze: How the fingers press: hierarchy, equal-torque, equal-normal, null-space.
+        protocol: pulls (lift, then forces and torques along each axis that grow until the object
+            slips), dexgraspbench (six pulls of 10 m/s^2 times the mass, without gravity).
+        force: Mean normal force of a contact [N].
+        mass: The object's [kg].
+        friction: The object's.
+        believed: Friction that the hierarchy of forces counts on.
+        probe: The touch to judge, 0 being the first; default: the last of each trial.
+        jobs: Processes.
+        cluster: Judge on a Dask cluster instead: the address of its scheduler.
+    """
+    scene = Scene.load(folder / "scene.json")
+    judges = [
+        Judge(scene, how, force, mass, friction, believed, by) for how in squeeze for by in protocol
+    ]
+    print(summary(judge_folder(folder, judges, probe, jobs, cluster)))
+    print(f"\njudged   {folder / Judging.file}")
 
 
 @app.command

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -112,6 +112,10 @@ class Judge:
             raise InputError(f"Judge.scene must be a Scene; got {self.scene!r}")
         if not callable(self.squeeze):
             one_of("squeeze", self.squeeze, SQUEEZES)
+
+    def within(self, scene: Scene) -> Judge:
+        """The same judge in another scene."""
+        return replace(self, scene=scene)
 
     def judge(self, grasp: Grasp) -> Judged:
         """Test one grasp, from the posture in which it was felt."""
