@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -91,6 +93,8 @@ class Judging:
         except (pa.ArrowException, OSError) as error:
             raise ResultsError(f"{folder} holds no results to judge: {error}") from error
         trials = sorted(set(table["trial"].to_pylist()))
+        if not trials:
+            raise ResultsError(f"{folder} has no trials to judge")
         if trials != list(range(len(trials))):
             raise ResultsError(f"{folder} lacks trials before {trials[-1]}; run its study again")
         found = tuple(_found(scene, rows_of(table, i), probe) for i in trials)
@@ -186,15 +190,16 @@ def judge_folder(
 ) -> pa.Table:
     """Judge the grasps of a results folder into DIR/judged.parquet; return the rows.
 
-    What is done is kept in DIR/judged/, and the same call continues.
+    What is done is kept in DIR/judged/, for each way of judging apart: the same call continues, and
+    another does not mix with it.
     """
     folder = Path(folder)
     judging, seed = Judging.of(folder, judges, probe)
-    if not judging.found:
-        raise ResultsError(f"{folder} has no trials to judge")
     study = Study(judging, len(judging.found), seed, jobs, cluster=cluster)
-    table = study.run(folder / "judged")
-    (folder / "judged" / Judging.file).replace(folder / Judging.file)
+    about = json.dumps(study.configuration(), sort_keys=True)
+    kept = folder / "judged" / hashlib.sha256(about.encode()).hexdigest()[:12]
+    table = study.run(kept)
+    (kept / Judging.file).replace(folder / Judging.file)
     return table
 
 
