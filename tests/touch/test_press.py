@@ -342,3 +342,30 @@ def test_a_driver_that_cannot_press_may_touch_and_is_told_apart(scene):
     with pytest.raises(hg.InputError, match="lacks hold, stop, wait"):
         hg.PhysicalProbe(Touches(hand, *TOUCHING[:4]), scene.articulated)
     require_press("my hand", hand)
+
+
+@pytest.mark.parametrize("robot", ["bhand", "umass_torso"])
+def test_hands_without_an_arm_and_with_another_one_press_too(robot):
+    began = hg.Start().draw(
+        hg.Scene(robot=robot, object=hg.Cylinder(0.05)),
+        lambda scene: hg.GeometricProbe(scene, "pass"),
+        np.random.default_rng(3),
+    )
+    hand = hg.SimulatedHand(began.scene, links="pass")
+    hand.place(began.grasp.q)
+    probe = hg.PhysicalProbe(hand, hand.robot)
+    felt = probe.touch(began.grasp.q)
+    torque = felt.jacobian.T @ (-3.0 * felt.normals).ravel()
+    torque[list(hand.robot.arm)] = 0.0
+    hand.press(torque)
+    told = waited(hand, 1.0)
+    assert told["fault"] == ""
+    fingers = torque != 0.0
+    followed = FOLLOWED * np.abs(torque).max()
+    np.testing.assert_allclose(told["torque"][-1][fingers], torque[fingers], atol=followed)
+    assert isinstance(probe.feel(), hg.Grasp)
+    q = hand.wait(0.0).q[-1]
+    assert hand.carry(q, 0.5) >= (0.5 if hand.robot.arm else 0.0)
+    assert waited(hand, 0.6)["fault"] == ""
+    np.testing.assert_allclose(hand.wait(0.1).torque[-1][hand.robot.idle], 0.0)
+    assert within_limits(hand)
