@@ -46,7 +46,7 @@ SILENT = 5  # samples of the fast loop, the same to the last bit, after which a 
 STARTLE = 1.0  # [N] more than at its beginning, a move in free air stops: a bump has momentum
 FOLLOWED = 0.05  # share of the largest torque asked to which every joint follows its own
 RESISTING = 0.5  # share of its torque below which a pressed joint meets nothing that resists
-GIVING = 0.3  # [s] after which such a joint stops the hand
+GIVING = 0.3  # [s] after which such a joint stops the hand, once its torque could be there
 MOVING, REACTING = 0.4, 0.05  # [s] in one call of the simulator, and while fingers press
 IDLE, CLOSING, HOLDING = 0, 1, 2
 
@@ -204,7 +204,6 @@ class SimulatedHand:
         self._zero = np.zeros((k, 3))  # [N] at the call of `close`
         self._touched, self._stalled = np.zeros(k, bool), np.zeros(k, bool)
         self._guard = np.full(k, GUARD * self.limits.force)  # [N] at which the hand stops
-        self._followed = np.zeros(len(self._fingers))  # (f,) [N·m] of it, by now
         self._motors = np.zeros(len(q))  # (n,) [N·m] lately
         self._giving = np.zeros(len(self._fingers))  # [s] without resistance
         self._fault = ""
@@ -355,7 +354,6 @@ class SimulatedHand:
             if self._ramp is not None:
                 self.stop()
             self._mode, self._now = [IDLE] * len(self._mode), [0.0] * len(self._mode)
-            self._followed = self._motors[self._fingers]
             self._giving[:] = 0.0
             self._guard[:] = GRIP_GUARD * self.limits.grip
             self._damp(self.limits.torque / (SPEED_SHARE * self.limits.speed))
@@ -395,11 +393,7 @@ class SimulatedHand:
             self._stand()
 
     def _stand(self) -> None:
-        """Where the joints are is where they shall be, but for those that press."""
-        here = np.clip(self._measured(), self._lower, self._upper)
-        if self._asked is not None:
-            here[self._fingers] = self._goal[self._fingers]
-        self._goal = here
+        self._goal = np.clip(self._measured(), self._lower, self._upper)
 
     def wait(self, duration: float) -> Readings:
         """See Driver."""
@@ -512,17 +506,11 @@ class SimulatedHand:
         """
         assert self._asked is not None
         j, most = self._fingers, PRESS_RATE * T * self._dt
-        change = np.clip(self._asked - self._followed, -most, most)
-        missing = self._followed - self._motors[j]
+        missing = self._asked - self._motors[j]
         missing[np.abs(missing) <= self._slack] = 0.0
-        self._followed = self._followed + change
-        wanted = np.clip(change + FORCE_GAIN * missing, -most, most) / self._kp[j]
-        fast = SPEED_SHARE * self.limits.speed[j] * T * self._dt
-        goal = self._goal[j] + np.clip(wanted, -fast, fast)
-        lead = LEAD * (np.abs(self._followed) + self._slack) / self._kp[j]
-        q = self._measured()[j]
-        goal = np.clip(goal, q - lead, q + lead)
-        return np.clip(goal, self._lower[j], self._upper[j]) - self._goal[j]
+        wanted = np.clip(FORCE_GAIN * missing, -most, most) / self._kp[j]
+        goal = np.clip(self._goal[j] + wanted, self._lower[j], self._upper[j])
+        return np.asarray(goal - self._goal[j])
 
     @property
     def _slack(self) -> float:
@@ -642,12 +630,14 @@ class SimulatedHand:
         return done
 
     def _runaway(self, steps: int) -> tuple[str, int] | None:
-        """A joint that pressed for GIVING without resistance, after `steps` more."""
-        j, aim = self._fingers, self._followed
-        firm = self._motors[j] * np.sign(aim) >= RESISTING * np.abs(aim) - self._slack
+        """A joint that pressed without resistance for too long, `steps` more included."""
+        assert self._asked is not None
+        aim = RESISTING * np.abs(self._asked)
+        firm = self._motors[self._fingers] * np.sign(self._asked) >= aim - self._slack
         self._giving = np.where(firm, 0.0, self._giving + steps * self._dt)
-        worst = int(self._giving.argmax())
-        return ("runaway", int(j[worst])) if self._giving[worst] > GIVING else None
+        over = self._giving - GIVING - aim / PRESS_RATE  # which is how long it takes to rise
+        worst = int(over.argmax())
+        return ("runaway", int(self._fingers[worst])) if over[worst] > 0.0 else None
 
     def _middle(self) -> np.ndarray:
         """Force (k, 3) [N] at the tips lately: the median, for a spike is nothing."""

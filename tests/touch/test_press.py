@@ -5,6 +5,7 @@ import pytest
 
 import hqp_grasp as hg
 from hqp_grasp.touch.driver import PRESS_RATE, TOUCHING, require_press
+from hqp_grasp.world.imperfections import Fault
 
 # Where the geometric probe felt balance, at the end of a trial of fmk.
 BALANCED = np.array([-0.089, 0.954, 0.153, 1.345, -0.114, 0.87, -0.405, 0.859, 1.206, 1.206, 0.915])
@@ -113,8 +114,10 @@ def test_what_hangs_from_the_fingers_does_not_creep(scene):
 
 def test_torque_is_followed_at_a_bounded_rate_and_then_kept(scene):
     hand, _ = held(scene)
+    holding = hand.wait(0.1).torque[-1][FINGERS]
     hand.press(equal(hand, 2.0))
-    waited(hand, 1.0)
+    began = waited(hand, 1.0)["torque"][:, FINGERS]
+    assert (began > 0.8 * holding).all(), "what was held is not let go first"
     asked = equal(hand, 8.0)
     hand.press(asked)
     rising = waited(hand, 0.6)
@@ -122,6 +125,26 @@ def test_torque_is_followed_at_a_bounded_rate_and_then_kept(scene):
     assert 0.5 * PRESS_RATE < steps.max() <= 1.1 * PRESS_RATE
     kept = waited(hand, 1.0)["torque"][:, FINGERS]
     np.testing.assert_allclose(kept, asked[FINGERS] + 0 * kept, rtol=FOLLOWED)
+
+
+def test_a_large_torque_takes_its_time_and_is_no_fault(scene):
+    hand, _ = held(scene)
+    hand.press(equal(hand, 14.0))
+    told = waited(hand, 1.5)
+    assert told["fault"] == ""
+    np.testing.assert_allclose(told["torque"][-1, FINGERS], equal(hand, 14.0)[FINGERS], rtol=0.07)
+
+
+def test_a_sensor_that_freezes_while_it_carries_does_not_stop_the_hand_but_is_told(scene):
+    fault = Fault("freeze", finger=1, begin=4.0)
+    imperfect = hg.Imperfections(faults=(fault,))
+    hand, probe = held(scene, support="pedestal", imperfections=imperfect)
+    hand.press(equal(hand, 5.0))
+    waited(hand, 1.0)
+    hand.carry(carried(hand, [0.0, 0.0, 0.1]), 3.0)
+    told = waited(hand, 2.0)
+    assert told["time"][-1] > 4.2 and told["fault"] == ""
+    assert probe.feel() == hg.Missed(hg.Miss.SENSOR, "finger_2")
 
 
 def test_readings_of_torque_are_what_the_tips_press_with(scene):
@@ -240,7 +263,10 @@ def test_fingers_that_press_nothing_stop_at_the_end_of_their_range_at_last(scene
     q[FINGERS] = hand.limits.lower[FINGERS] + 0.05
     hand.place(q)
     hand.press(-equal(hand, 5.0))
-    assert "meets nothing" in waited(hand, 1.5)["fault"]
+    told = waited(hand, 1.5)
+    assert "meets nothing" in told["fault"]
+    slowly = PRESS_RATE / 10.0  # [rad/s] of a servo of 10 N·m/rad
+    assert np.abs(told["velocity"][:, FINGERS]).max() < 1.1 * slowly
     assert within_limits(hand)
 
 
