@@ -543,7 +543,7 @@ def carrying_keeps_what_is_pressed(rig: Rig) -> None:
         raise DriverError("carry drops what is pressed")
     if j is not None:
         asked, did = target[j] - q[j], float(moved.q[-1, j] - q[j])
-        if did * asked < FOLLOWED * asked**2:
+        if did * asked < IGNORED * asked**2:  # what it holds stands still, and holds it back
             raise DriverError(
                 f"carry does not move: {rig.joint(j)} was sent by {asked:+.3f} rad and reads "
                 f"{did:+.3f}"
