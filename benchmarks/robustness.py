@@ -3,9 +3,10 @@
     python benchmarks/robustness.py --starts 25 --seed 71 --jobs 2
 
 From each start every controller finds its grasp: the first touch alone, each law alone, every
-order of two and of three that differs, all three superposed at one priority, and the paper's form. The judge
-then squeezes each by the hierarchy of forces, and by equal torques of the same sum of normal
-forces; frees, lifts and pulls. What is compared is the force at the weakest axis, pair by pair.
+order of two and of three that differs, all three superposed at one priority, and the paper's form.
+The judge then squeezes each by the hierarchy of forces, and by equal torques of the same sum of
+normal forces; frees, lifts and pulls. What is compared, pair by pair, is the force at the weakest
+axis.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ SCENES = {
     "hexagon": hexagon.scene,
     "irregular": irregular.scene,
 }
-# The kinematic law asks for a step of every joint, so what stands below it is never felt: fkm is fk,
-# mkf is mk, and all that begin with k are k.
+# The kinematic law asks for a step of every joint, so what stands below it is never felt: fkm is
+# fk, mkf is mk, and all that begin with k are k.
 ORDERS = ["".join(p) for size in (1, 2, 3) for p in permutations("fmk", size) if "k" not in p[:-1]]
 CONTROLLERS = ("first touch", *ORDERS, "superposed", "paper")
 SQUEEZES = ("hierarchy", "equal-torque")
