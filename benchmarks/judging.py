@@ -61,9 +61,8 @@ def main(options: Options) -> None:
             strengths[name].append(replace(judge, **change).judge(grasp).weakest_axis)
             bench.NOSLIP = iterations
     standard = np.array(strengths["standard"])
-    print(
-        f"\n{len(standard)} grasps, weakest axis {np.median(standard):.2f} N (least {standard.min():.2f})"
-    )
+    middle, least = np.median(standard), standard.min()
+    print(f"\n{len(standard)} grasps, weakest axis {middle:.2f} N (least {least:.2f})")
     print(f"the same to the last bit on repeat: {again} of {len(standard)}")
     late = np.percentile(seconds, 95)
     print(f"CPU of one: median {np.median(seconds):.2f} s, 95th percentile {late:.2f} s\n")
