@@ -87,6 +87,12 @@ mutants: $(READY_DEV)
 # into docs/images/, their data into docs/data/. tests/test_packaging.py knows if docs quote a command that is not here.
 RESULTS := out/results
 keep = $(PY) $(2) > $(RESULTS)/$(1).txt
+define judged
+$(PY) scenarios/$(1).py --trials 40 --probes 20 --seed 83 --out $(RESULTS)/judged-$(1) > $(RESULTS)/judged-$(1).txt
+$(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --protocol pulls dexgraspbench >> $(RESULTS)/judged-$(1).txt
+$(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --force 10 --mass 0.5 >> $(RESULTS)/judged-$(1).txt
+$(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --force 1 --protocol dexgraspbench >> $(RESULTS)/judged-$(1).txt
+endef
 study = $(PY) scenarios/$(1).py --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
 
 results: $(READY_BENCH) pictures
@@ -118,6 +124,12 @@ results: $(READY_BENCH) pictures
 	$(call keep,compositions,benchmarks/compositions.py --trials 20 --seed 31)
 	$(call keep,figure5,scenarios/cylinder_65.py --robot umass_torso --probe physical --preset loadcell --trials 20 --probes 25 --out $(RESULTS)/figure5)
 	$(call keep,forces,benchmarks/forces.py)
+	$(call judged,cylinder)
+	$(call judged,cylinder_65)
+	$(call judged,hexagon)
+	$(call judged,irregular)
+	$(call keep,judging,benchmarks/judging.py --grasps 12 --seed 73)
+	$(call keep,robustness,benchmarks/robustness.py --starts 20 --seed 71 --plot docs/images/robustness.png)
 	$(call keep,sensing,benchmarks/sensing.py --plot docs/images/sensing.png)
 	$(call keep,physics-figure5,benchmarks/physics.py figure5 --trials 20 --plot docs/images/figure5.png)
 	$(call keep,physics-closing,benchmarks/physics.py closing)

@@ -28,6 +28,7 @@ PYTHON_ON = [
     "any-robot.md",
     "forces.md",
     "index.md",
+    "judging.md",
     "looking.md",
     "many-trials.md",
     "mink.md",
