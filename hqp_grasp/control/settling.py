@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from hqp_grasp.control.limits import cap_ratio
 from hqp_grasp.grasp import Grasp, Touch
+from hqp_grasp.mechanics import friction_demand
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Stack, Task
 
 Beside = tuple[Task, ...]  # laws at one priority
@@ -18,6 +20,8 @@ MOMENT_GOAL = (2e-3) ** 2  # [(N·m)²] ε_m of one, at most
 BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
 BETTER = 2e-3  # [rad] by which the other laws' errors fall, or the grasp is no better
 TELLING = 2.0  # standard errors that tell two values apart
+SECURE = 0.2  # [–] friction demand of a grasp that holds on nearly all that hands touch, at most
+HOPE = 10  # touches that bring no better grasp, before one that is secure is kept
 PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
 SAME_ROUNDING = 1e-6  # [m] radii of one tip differ by, as long as it is a ball
@@ -31,12 +35,16 @@ class Course:
     noise within BEYOND times its floor. It counts only where the laws above them are as near as
     they ever were: none of these is given up for balance. BETTER shows in as many grasps as average
     the noise to it. A grasp that is not there any more, because the object has moved, is forgotten.
+
+    Where no grasp balances, as on walls that lean, friction may hold the object all the same: the
+    hand keeps the grasp of least friction demand. It looks for a better one as long as there are
+    touches left; but from one that is SECURE, only until HOPE touches have brought none.
     """
 
     stack: Stack
     history: Sequence[Touch]
     scores: np.ndarray  # of each touch: errors by what a balanced grasp has at most; inf: a miss
-    nearest: int  # touch that is nearest to balance, where noise counts against a grasp
+    nearest: int  # touch of least friction demand, or nearest to balance by the laws there are
     best: int  # touch with the best of the balanced grasps, −1: none
     worse: int  # balanced grasps that were worse than the best before
     over: bool  # whether it is time to go back
@@ -78,8 +86,10 @@ class Course:
                 stale += not lost
                 if isinstance(touch.felt, Grasp) and _near(touch.q_target, history[best]):
                     best, stale, lost = -1, 0, False
-        nearest = int(np.where(served, doubtful, np.inf).argmin())
         over = lost or stale >= patience
+        nearest = best
+        if best < 0:
+            nearest, over = _nearest(history, served, doubtful, all(balance))
         return cls(stack, history, scores, nearest, best, worse, over)
 
     @property
@@ -107,19 +117,45 @@ class Course:
         """The posture (n,) [rad] to return to, or None while there is reason to go on.
 
         Balanced grasps are kept: once the laws below force and moment improve no more, once a step
-        from a balanced grasp lost it, and when the touches `left` only just suffice.
+        from a balanced grasp lost it, and when the touches `left` only just suffice. So is the
+        nearest, where there is none.
         """
-        best = self.best
-        if best >= 0 and self.over:
-            return self.history[best].felt.q  # type: ignore[union-attr]
+        q: np.ndarray = self.history[self.nearest].felt.q  # type: ignore[union-attr]
+        if self.over:
+            return q
         if left is not None:
-            best = best if best >= 0 else self.nearest
-            q: np.ndarray = self.history[best].felt.q  # type: ignore[union-attr]
             last = [t.felt for t in self.history if isinstance(t.felt, Grasp)][-1]
             # A step further, and it would take one more to return.
             if left <= 1.0 + np.ceil(cap_ratio(q - last.q, self.stack, last)):
                 return q
         return None
+
+
+def _nearest(
+    history: Sequence[Touch], served: np.ndarray, doubtful: np.ndarray, whole: bool
+) -> tuple[int, bool]:
+    """The touch to keep where none balances, and whether it is secure and nothing betters it.
+
+    By the friction that it needs, where the laws balance the `whole` wrench; then, or else, by the
+    `doubtful` scores.
+    """
+    nearest, least, stale, secure = -1, (np.pi, np.inf), 0, np.arctan(SECURE)
+    for i, touch in enumerate(history):
+        stale += 1
+        if not served[i]:
+            continue
+        value = (_friction_angle(touch.felt) if whole else 0.0, doubtful[i])  # type: ignore[arg-type]
+        gone = value[0] > secure >= least[0] and _near(touch.q_target, history[nearest])
+        if gone or nearest < 0 or _differ(value, least, BETTER) < 0:
+            nearest, least, stale = i, value, 0
+    return nearest, bool(whole and least[0] <= secure and stale >= HOPE)
+
+
+@lru_cache(maxsize=512)
+def _friction_angle(grasp: Grasp) -> float:
+    """Angle [rad] whose tangent is the friction demand, the larger for noise of the normals."""
+    noise = max(contact.noise for contact in grasp.contacts)
+    return float(np.arctan(friction_demand(grasp.positions, grasp.normals))) + TELLING * noise
 
 
 def _errors(hits: Sequence[Grasp]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,10 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL
+from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, SECURE
 from hqp_grasp.errors import SingularTaskError, one_of
 from hqp_grasp.grasp import Grasp, Missed
 from hqp_grasp.hierarchy.level import Solution
+from hqp_grasp.mechanics import friction_demand
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.tasks.stack import Stack, Task
 from hqp_grasp.touch.simulated import SimulatedHand
@@ -22,12 +23,15 @@ from hqp_grasp.world.robot import Robot
 CONVERGED_FORCE = FORCE_GOAL  # [N²]
 CONVERGED_MOMENT = float(np.sqrt(MOMENT_GOAL))  # √ε_m [N·m]
 
+LEAN_STEPS = 20  # after which the direction that normals lean towards stands still
+LIKE = 2e-3  # [–] sines of leans that differ by less count as the same
 # Name, unit and meaning of the columns that every probe fills.
 COLUMNS = {
     "eps_f": "N^2: squared net force of unit contact forces",
     "eps_m": "(N m)^2: squared net moment about the contact centroid",
     "eps_k": "rad: mean angle between flexion velocity and normal",
     "eps_k_eq7": "m/rad: sum of eq. 7 over the contacts",
+    "friction_demand": "1: least friction coefficient with which the contacts can balance; inf: none",
     "adduction_deg": "deg: the spread joint's angle",
     "elevation_deg": "deg: the palm's approach axis below the horizontal",
     "in_contact": "bool: every finger touches",
@@ -47,6 +51,7 @@ COLUMNS = {
 TRUE_COLUMNS = {
     "eps_f_true": "N^2: as eps_f, of the contacts as they are; null where a tip is not in contact",
     "eps_m_true": "(N m)^2: as eps_m, of the contacts as they are",
+    "friction_demand_true": "1: as friction_demand, of the contacts as they are",
     "object_moved": "m: the object's middle, since the first touch began",
     "floor_f": "N^2: eps_f that a balanced grasp is felt with, by the sensors' noise, on average",
     "floor_m": "(N m)^2: eps_m, likewise",
@@ -54,11 +59,16 @@ TRUE_COLUMNS = {
     "peak_speed": "share of its limit: the fastest joint so far, as it is",
     "peak_torque": "share of its limit: the largest of any joint so far, as it is",
 }
+VERDICT_COLUMNS = (  # that verdicts read beside trial, probe and error; the true ones where known
+    *("in_contact", "other_links", "limit_violation", "eps_f", "eps_m", "eps_f_true", "eps_m_true"),
+    *("friction_demand", "friction_demand_true"),
+)
 BALANCE_COLUMNS = ("eps_f", "eps_m", "floor_f", "floor_m")
 # The columns that say the same in every row of a trial.
 TRIAL_COLUMNS = {
     "rejected": "starting postures that did not touch",
     "error": "what ended the trial, kind and message; null where nothing did",
+    "unbalanced": "why no balanced grasp is felt at the end; null where one is",
 }
 # The columns of each law, by its name: error_force, status_force, rank_force.
 LAW_COLUMNS = {
@@ -74,7 +84,7 @@ CONTACT_COLUMNS = {
 JOINT_COLUMN = "rad: joint angle"
 # "good", and what keeps a trial from being so, the gravest first.
 VERDICTS = ("good", "error", "lost", "not balanced", "link inside", "violation")
-TEXTS = {"outcome", "other_links", "in_transit", "method", "error", "reaction", "planner"}
+TEXTS = {"unbalanced", "outcome", "other_links", "in_transit", "method", "error", "reaction", "planner"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,15 +135,38 @@ class Record:
         return None if last == len(bad) - 1 else last + 1
 
     @property
+    def unbalanced(self) -> str | None:
+        """Why no balanced grasp is felt at the end, in one line; None where one is."""
+        if self.converged_at is not None or not self.grasps:
+            return None  # balanced; or lost from the start
+        lean, most = _leans(np.concatenate([grasp.normals for grasp in self.grasps]))
+        if most > 0.0 and (self.grasps[-1].k * np.sin(most)) ** 2 > CONVERGED_FORCE:
+            about = np.degrees(lean)
+            return f"walls lean by about {about:.0f}°: equal forces cannot balance"
+        if self.lost:
+            return "the object is not touched at the end"
+        force = float(self.rows[-1]["eps_f"])  # type: ignore[arg-type]
+        what = "forces" if force > CONVERGED_FORCE else "moments"
+        return f"no grasp was found whose {what} balance"
+
+    @property
+    def secure(self) -> bool:
+        """Whether the grasp at the end needs a friction of SECURE at most; see `secures`."""
+        return secures(self._verdict_table())[0]
+
+    @property
     def verdict(self) -> str:
         """What became of the trial, one of VERDICTS; see `verdicts`."""
-        names = ("in_contact", "other_links", "limit_violation", "eps_f", "eps_m")
-        there = [n for n in (*names, "eps_f_true", "eps_m_true") if n in self.rows[0]]
+        return verdicts(self._verdict_table())[0]
+
+    def _verdict_table(self) -> pa.Table:
+        """The columns that verdicts read."""
+        there = [name for name in VERDICT_COLUMNS if name in self.rows[0]]
         rows = [
             {"trial": 0, "probe": i, "error": self.error} | {name: row[name] for name in there}
             for i, row in enumerate(self.rows)
         ]
-        return verdicts(pa.Table.from_pylist(rows))[0]
+        return pa.Table.from_pylist(rows)
 
     def to_table(self) -> pa.Table:
         """One row a probe; unit and meaning of a column stand in its field's metadata."""
@@ -142,6 +175,7 @@ class Record:
             "probe": list(range(count)),
             "rejected": [self.rejected] * count,
             "error": [self.error] * count,
+            "unbalanced": [self.unbalanced] * count,
         }
         values |= {name: [row[name] for row in self.rows] for name in self.rows[0]}
         meanings = {"probe": "0 is the first touch", **TRIAL_COLUMNS}
@@ -176,6 +210,23 @@ def balanced(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     for limit, floor in zip(limits, floors, strict=False):  # a geometric probe's has none
         np.fmax(limit, BEYOND * floor, out=limit)
     return (eps_f <= limits[0]) & (eps_m <= limits[1])  # NaN: not
+
+
+def _leans(normals: np.ndarray) -> tuple[float, float]:
+    """By what angle [rad] the normals (m, 3) lean: in the median, and three quarters of them.
+
+    All towards one direction, that in which they differ least, as on a cone: those of an edge or
+    an end, being far from the others, count the less for it.
+    """
+    weight = np.ones(len(normals))
+    for _ in range(LEAN_STEPS):
+        away = normals - weight @ normals / weight.sum()
+        axis = np.linalg.eigh((weight[:, None] * away).T @ away)[1][:, 0]
+        sines = normals @ axis
+        middle = np.median(sines)
+        weight = 1.0 / np.maximum(np.abs(sines - middle), LIKE)
+    sines = np.clip(sines * np.copysign(1.0, middle), -1.0, 1.0)
+    return float(np.arcsin(np.median(sines))), float(np.arcsin(np.quantile(sines, 0.25)))
 
 
 def meaning(column: str) -> str:
@@ -230,6 +281,7 @@ def felt_row(
         "eps_m": MomentTask().potential(grasp),
         "eps_k": _kinematic(grasp, "angle", np.mean),
         "eps_k_eq7": _kinematic(grasp, "eq7", np.sum),
+        "friction_demand": friction_demand(grasp.positions, grasp.normals),
         "adduction_deg": angle,
         "elevation_deg": _elevation(robot.palm(grasp.q)[1]),
         "in_contact": True,
@@ -288,10 +340,13 @@ def true_columns(
 
 
 def true_errors(grasp: Grasp | None) -> dict[str, object]:
-    """Columns eps_f_true and eps_m_true of a grasp as it is; None where a tip does not touch."""
+    """What the errors of a grasp are, as it is; None where a tip does not touch."""
+    if grasp is None:
+        return dict.fromkeys(("eps_f_true", "eps_m_true", "friction_demand_true"))
     return {
-        "eps_f_true": None if grasp is None else ForceTask().potential(grasp),
-        "eps_m_true": None if grasp is None else MomentTask().potential(grasp),
+        "eps_f_true": ForceTask().potential(grasp),
+        "eps_m_true": MomentTask().potential(grasp),
+        "friction_demand_true": friction_demand(grasp.positions, grasp.normals),
     }
 
 
@@ -331,22 +386,55 @@ def verdicts(table: pa.Table) -> dict[int, str]:
     probe from 1 on, no violation of a limit, no error.
     """
     rows = in_order(table)
-    trial = rows["trial"].to_numpy()
-    begin = np.flatnonzero(np.diff(trial, prepend=np.nan))
-    last = np.append(begin[1:], len(trial)) - 1
-    eps = (f"{e}_true" if f"{e}_true" in rows.column_names else e for e in ("eps_f", "eps_m"))
-    force, moment = (floats(rows, name)[last] for name in eps)
-    faults = (
+    begin, last = ends(rows)
+    force, moment = (known(rows, name)[last] for name in ("eps_f", "eps_m"))
+    error, lost, link, violation = _faults(rows, begin, last)
+    unbalanced = ~((force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2))
+    gravest = np.select((error, lost, unbalanced, link, violation), range(1, len(VERDICTS)), 0)
+    trial = rows["trial"].to_numpy()[begin]
+    return {int(i): VERDICTS[kind] for i, kind in zip(trial, gravest, strict=True)}
+
+
+def secures(table: pa.Table, demand: float = SECURE) -> dict[int, bool]:
+    """Whether each trial ends secure: in a grasp that holds with a friction of `demand`.
+
+    The friction demand (the true one, where it differs from what was felt) is that at the last
+    touch; no link is in the object, no limit violated, and there is no error, as for `verdicts`.
+    """
+    rows = in_order(table)
+    begin, last = ends(rows)
+    found = known(rows, "friction_demand")[last] <= demand  # NaN: not
+    found &= ~np.logical_or.reduce(_faults(rows, begin, last))
+    trial = rows["trial"].to_numpy()[begin]
+    return {int(i): bool(secure) for i, secure in zip(trial, found, strict=True)}
+
+
+def _faults(rows: pa.Table, begin: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of each trial: an error, lost, a link inside, a violation."""
+    inside = says_something(rows, "other_links") & (rows["probe"].to_numpy() > 0)
+    return (
         np.logical_or.reduceat(says_something(rows, "error"), begin),
         ~rows["in_contact"].to_numpy()[last],
-        ~((force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2)),
-        np.logical_or.reduceat(
-            says_something(rows, "other_links") & (rows["probe"].to_numpy() > 0), begin
-        ),
+        np.logical_or.reduceat(inside, begin),
         np.logical_or.reduceat(floats(rows, "limit_violation") > 0.0, begin),
     )
-    gravest = np.select(faults, range(1, len(VERDICTS)), 0)
-    return {int(i): VERDICTS[kind] for i, kind in zip(trial[begin], gravest, strict=True)}
+
+
+def ends(rows: pa.Table) -> tuple[np.ndarray, np.ndarray]:
+    """First and last row of each trial of a table in order."""
+    trial = rows["trial"].to_numpy()
+    begin = np.flatnonzero(np.diff(trial, prepend=np.nan))
+    return begin, np.append(begin[1:], len(trial)) - 1
+
+
+def known(rows: pa.Table, name: str) -> np.ndarray:
+    """A column of numbers as it is, where that is known beside what is felt."""
+    return floats(rows, f"{name}_true" if f"{name}_true" in rows.column_names else name)
+
+
+def holds(demand: float) -> str:
+    """What a friction demand means to whoever holds the object."""
+    return f"holds if µ ≥ {demand:.2f}" if np.isfinite(demand) else "no friction holds it"
 
 
 def in_order(table: pa.Table) -> pa.Table:
