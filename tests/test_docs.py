@@ -29,6 +29,7 @@ PYTHON_ON = [
     "forces.md",
     "index.md",
     "judging.md",
+    "laws.md",
     "looking.md",
     "many-trials.md",
     "mink.md",

@@ -220,7 +220,7 @@ class HierarchyForm:
         history = steadied(history)
         grasp = history[last].felt  # type: ignore[assignment]
         course = Course.of(stack, history)
-        back = course.way_back(left)
+        back = course.way_back(left, grasp)
         if back is not None:
             return self._back(stack, grasp, back, begin)
         way = self._way(stack, grasp, history, careful)

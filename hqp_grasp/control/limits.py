@@ -138,12 +138,17 @@ class RetreatLimit(Limit):
 
 def cap_ratio(x: np.ndarray, stack: Stack, grasp: Grasp) -> float:
     """How many times too long x is for the caps of its stack; 1 or less: it fits."""
-    ratio = 0.0
+    return float(cap_ratios(x[None], stack, grasp)[0])
+
+
+def cap_ratios(steps: np.ndarray, stack: Stack, grasp: Grasp) -> np.ndarray:
+    """The same of several steps (m, n) from one grasp."""
+    ratios = np.zeros(len(steps))
     for level in _caps(stack, grasp):
-        value = level.A @ x
+        value = steps @ level.A.T
         bound = np.where(value > 0.0, level.upper, -level.lower)
-        ratio = max(ratio, float((np.abs(value) / bound).max(initial=0.0)))
-    return ratio
+        ratios = np.maximum(ratios, (np.abs(value) / bound).max(axis=1, initial=0.0))
+    return ratios
 
 
 def _caps(stack: Stack, grasp: Grasp) -> list[Level]:

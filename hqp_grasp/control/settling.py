@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from hqp_grasp.control.limits import cap_ratio
+from hqp_grasp.control.limits import cap_ratios
 from hqp_grasp.grasp import Grasp, Touch
 from hqp_grasp.mechanics import friction_demand
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Stack, Task
@@ -113,22 +113,41 @@ class Course:
             halvings += len(self.unbalanced) - 1
         return 0.5 ** max(halvings, 0)
 
-    def way_back(self, left: int | None) -> np.ndarray | None:
-        """The posture (n,) [rad] to return to, or None while there is reason to go on.
+    def way_back(self, left: int | None, grasp: Grasp | None = None) -> np.ndarray | None:
+        """The posture (n,) [rad] to go to on the way back, or None while there is reason to go on.
 
         Balanced grasps are kept: once the laws below force and moment improve no more, once a step
         from a balanced grasp lost it, and when the touches `left` only just suffice. So is the
-        nearest, where there is none.
+        nearest, where there is none. The way begins at `grasp`, or at the last one felt.
         """
-        q: np.ndarray = self.history[self.nearest].felt.q  # type: ignore[union-attr]
-        if self.over:
-            return q
-        if left is not None:
-            last = [t.felt for t in self.history if isinstance(t.felt, Grasp)][-1]
-            # A step further, and it would take one more to return.
-            if left <= 1.0 + np.ceil(cap_ratio(q - last.q, self.stack, last)):
-                return q
-        return None
+        if not self.over and left is None:
+            return None
+        way = self._way(grasp)
+        # A step further, and it would take one more to return.
+        return way[0] if self.over or left <= 1 + len(way) else None  # type: ignore[operator]
+
+    def _way(self, grasp: Grasp | None) -> list[np.ndarray]:
+        """Postures (n,) [rad] to head for, touch by touch, until the nearest grasp is reached.
+
+        They are of grasps felt before, within the caps of the one before or next to it in the
+        history: straight on there may be nothing to touch.
+        """
+        goal = self.history[self.nearest].felt
+        hits = [t.felt for t in self.history if isinstance(t.felt, Grasp)]
+        q = np.array([felt.q for felt in hits])
+        start = len(hits) - 1 if grasp is None else hits.index(grasp)
+        ways: dict[int, list[np.ndarray]] = {start: []}
+        for i in (queue := [start]):
+            if hits[i] is goal:
+                break
+            touches = np.maximum(np.ceil(cap_ratios(q - q[i], self.stack, hits[i])), 1.0)
+            touches[np.abs(q - q[i]).max(axis=1) < BACK] = 0.0  # the hand is there
+            beside = [j for j in (i - 1, i + 1) if 0 <= j < len(hits)]
+            for j in (*np.flatnonzero(touches <= 1.0).tolist(), *beside):
+                if j not in ways:
+                    ways[j] = [*ways[i], *[q[j]] * int(touches[j])]
+                    queue.append(j)
+        return ways[i] or [q[i]]
 
 
 def _nearest(
@@ -144,7 +163,7 @@ def _nearest(
         stale += 1
         if not served[i]:
             continue
-        value = (_friction_angle(touch.felt) if whole else 0.0, doubtful[i])  # type: ignore[arg-type]
+        value = (_friction_angle(touch.felt) if whole else 0.0, doubtful[i])
         gone = value[0] > secure >= least[0] and _near(touch.q_target, history[nearest])
         if gone or nearest < 0 or _differ(value, least, BETTER) < 0:
             nearest, least, stale = i, value, 0

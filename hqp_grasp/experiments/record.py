@@ -31,7 +31,7 @@ COLUMNS = {
     "eps_m": "(N m)^2: squared net moment about the contact centroid",
     "eps_k": "rad: mean angle between flexion velocity and normal",
     "eps_k_eq7": "m/rad: sum of eq. 7 over the contacts",
-    "friction_demand": "1: least friction coefficient with which the contacts can balance; inf: none",
+    "friction_demand": "1: least friction coefficient that lets the contacts balance; inf: none",
     "adduction_deg": "deg: the spread joint's angle",
     "elevation_deg": "deg: the palm's approach axis below the horizontal",
     "in_contact": "bool: every finger touches",
@@ -84,7 +84,16 @@ CONTACT_COLUMNS = {
 JOINT_COLUMN = "rad: joint angle"
 # "good", and what keeps a trial from being so, the gravest first.
 VERDICTS = ("good", "error", "lost", "not balanced", "link inside", "violation")
-TEXTS = {"unbalanced", "outcome", "other_links", "in_transit", "method", "error", "reaction", "planner"}
+TEXTS = {
+    "unbalanced",
+    "outcome",
+    "other_links",
+    "in_transit",
+    "method",
+    "error",
+    "reaction",
+    "planner",
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -152,15 +161,15 @@ class Record:
     @property
     def secure(self) -> bool:
         """Whether the grasp at the end needs a friction of SECURE at most; see `secures`."""
-        return secures(self._verdict_table())[0]
+        return secures(self.verdict_table())[0]
 
     @property
     def verdict(self) -> str:
         """What became of the trial, one of VERDICTS; see `verdicts`."""
-        return verdicts(self._verdict_table())[0]
+        return verdicts(self.verdict_table())[0]
 
-    def _verdict_table(self) -> pa.Table:
-        """The columns that verdicts read."""
+    def verdict_table(self) -> pa.Table:
+        """The columns that `verdicts` and `secures` read, as of trial 0."""
         there = [name for name in VERDICT_COLUMNS if name in self.rows[0]]
         rows = [
             {"trial": 0, "probe": i, "error": self.error} | {name: row[name] for name in there}

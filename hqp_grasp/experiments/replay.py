@@ -26,6 +26,7 @@ from hqp_grasp.experiments.record import (
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
     Record,
+    holds,
 )
 from hqp_grasp.files import whole_file
 from hqp_grasp.world.objects import OBJECT
@@ -33,7 +34,7 @@ from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
 
 Colour = tuple[int, int, int]
-ERRORS = ("eps_f", "eps_m", "eps_k")  # in N², (N·m)², rad
+ERRORS = ("eps_f", "eps_m", "eps_k", "friction_demand")  # in N², (N·m)², rad, 1
 PLACED = 1e-5  # [m] tips fit their contacts to this, or the hand is elsewhere
 SECONDS_A_PROBE = 1.0  # the time bar counts seconds, so it counts probes
 ARROW = 0.04  # [m] a unit vector, a force of 1 N
@@ -116,7 +117,7 @@ def _frames(rows: Sequence[Mapping[str, Any]], felt: Sequence[_Felt | None]) -> 
     for row, new in zip(rows, felt, strict=True):
         last = new or last
         outcome = row["outcome"] or outcome  # rows after the end of a trial say nothing
-        errors = {e: float("nan") if row[e] is None else float(row[e]) for e in ERRORS}
+        errors = {e: float("nan") if row.get(e) is None else float(row[e]) for e in ERRORS}
         frames.append(Frame(*last, errors, str(outcome), new is not None))
     return frames
 
@@ -455,12 +456,14 @@ def describe(frames: Sequence[Frame], probe: int) -> list[str]:
             f"net moment  √ε_m = {1e3 * np.sqrt(e['eps_m']):.2e} mm·N",
             f"flexion angle  ε_k = {e['eps_k']:.3f} rad",
         ]
+        if not np.isnan(e["friction_demand"]):  # older folders lack it
+            lines.append(holds(e["friction_demand"]))
     return lines
 
 
 def errors_figure(frames: Sequence[Frame]) -> Figure:
     """The errors of one trial over its probes; what the arrows' colours mean stands below."""
-    force, moment, angle = (np.array([f.errors[e] for f in frames]) for e in ERRORS)
+    force, moment, angle = (np.array([f.errors[e] for f in frames]) for e in ERRORS[:3])
     figure = Figure(figsize=(4.2, 3.9), dpi=200, facecolor="white")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     figure.subplots_adjust(left=0.16, right=0.97, top=0.97, bottom=0.24, hspace=0.08)

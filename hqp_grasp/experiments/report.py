@@ -13,22 +13,24 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from hqp_grasp.control.settling import SECURE
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.record import (
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
+    VERDICT_COLUMNS,
     VERDICTS,
+    ends,
     floats,
     in_order,
+    known,
+    secures,
     verdicts,
 )
 
 Z = 1.96  # standard deviations of a 95 % interval
 SHOWN = 5  # trials named of each kind of failure
-COLUMNS = (
-    *("trial", "seed", "probe", "eps_f", "eps_m", "in_contact", "other_links"),
-    *("limit_violation", "error", "adduction_deg", "outcome", "method"),
-)
+COLUMNS = ("trial", "seed", "probe", "error", "adduction_deg", *VERDICT_COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,9 @@ class Outcome:
     verdict: str  # one of VERDICTS
     balanced_at: int | None  # first probe from which force and moment stay balanced
     adduction: float  # [deg] at the last touch; NaN where there is none
+    secure: bool | None  # at the end; see `secures`. None in a folder from before friction demands
+    secure_at: int | None  # first probe whose grasp needs a friction of SECURE at most
+    secure_since: int | None  # probe from which every grasp does, to the end
 
 
 def outcomes(folder: str | Path) -> list[Outcome]:
@@ -47,38 +52,50 @@ def outcomes(folder: str | Path) -> list[Outcome]:
     path = Path(folder) / "probes.parquet"
     try:
         have = pq.read_schema(path).names
-        wanted = [name for name in (*COLUMNS, "eps_f_true", "eps_m_true") if name in have]
-        table = pq.read_table(path, columns=wanted)
+        table = pq.read_table(path, columns=[name for name in COLUMNS if name in have])
     except FileNotFoundError as error:
         raise ResultsError(f"{folder} has no probes.parquet: it is no results folder") from error
     except (pa.ArrowException, OSError) as error:
         raise ResultsError(f"{path} is broken ({error}); run its scenario again") from error
     table = in_order(table)
-    verdict = verdicts(table)
-    true = "_true" if "eps_f_true" in have else ""
+    verdict, secure = verdicts(table), {}
+    demand = np.full(len(table), np.nan)
+    if "friction_demand" in have:
+        secure, demand = secures(table), known(table, "friction_demand")
     trial, seed = (table[name].to_numpy() for name in ("trial", "seed"))
-    force, moment, adduction = (
-        floats(table, name) for name in (f"eps_f{true}", f"eps_m{true}", "adduction_deg")
-    )
-    balanced = (force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2)  # NaN: not
-    begin = np.flatnonzero(np.diff(trial, prepend=-1))
-    end = np.append(begin[1:], len(trial))
+    force, moment = (known(table, name) for name in ("eps_f", "eps_m"))
+    adduction = floats(table, "adduction_deg")
+    begin, end = ends(table)
     row = np.arange(len(trial))
-    stays = (
-        np.maximum.reduceat(np.where(balanced, -1, row), begin) + 1
-    )  # the row from which it does
-    stays = np.maximum(stays, begin)
+    balanced = (force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2)  # NaN: not
     touch = np.maximum.reduceat(np.where(table["in_contact"].to_numpy(), row, -1), begin)
+    holding = demand <= SECURE
+    found = np.minimum.reduceat(np.where(holding, row, len(row)), begin)
     return [
         Outcome(
             int(seed[first]),
             int(trial[first]),
             verdict[int(trial[first])],
-            int(since - first) if since < after else None,
-            float(adduction[last]) if last >= 0 else math.nan,
+            _probe(since - first, last - first),
+            float(adduction[at]) if at >= 0 else math.nan,
+            secure.get(int(trial[first])),
+            _probe(reached - first, last - first),
+            _probe(kept - first, last - first),
         )
-        for first, after, since, last in zip(begin, end, stays, touch, strict=True)
+        for first, last, at, since, reached, kept in zip(
+            begin, end, touch, _stays(balanced, begin), found, _stays(holding, begin), strict=True
+        )
     ]
+
+
+def _stays(holds: np.ndarray, begin: np.ndarray) -> np.ndarray:
+    """The row of each trial from which `holds` is true to its end; the one after it: none."""
+    broken = np.maximum.reduceat(np.where(holds, -1, np.arange(len(holds))), begin)
+    return np.asarray(np.maximum(broken + 1, begin))
+
+
+def _probe(probe: int, last: int) -> int | None:
+    return int(probe) if probe <= last else None
 
 
 def interval(count: int, total: int) -> tuple[float, float]:
@@ -110,22 +127,33 @@ def report(folders: Sequence[str | Path]) -> str:
         raise InputError("a report needs at least one results folder")
     studies = {str(folder): outcomes(folder) for folder in folders}
     width = max(len(name) for name in studies)
-    heads = ("good", *VERDICTS[1:], "probes to balance", "adduction at the end")
-    rows = [f"{'':{width}}  {'trials':>6}  {'good [95 %]':>21}" + _cells(heads[1:])]
+    heads = (*VERDICTS[1:], "probes to balance", "adduction at the end")
+    shares = f"{'good [95 %]':>21}  {'secure [95 %]':>21}"
+    rows = [f"{'':{width}}  {'trials':>6}  {shares}" + _cells(heads)]
     for name, found in studies.items():
         count = Counter(outcome.verdict for outcome in found)
-        low, high = interval(count["good"], len(found))
-        good = f"{count['good']} [{low:.1%}, {high:.1%}]"
+        good = _share(count["good"], len(found))
+        ends_so = [outcome.secure for outcome in found if outcome.secure is not None]
+        secure = _share(sum(ends_so), len(ends_so)) if ends_so else "–"
         at = [outcome.balanced_at for outcome in found if outcome.balanced_at is not None]
         angles = [o.adduction for o in found if o.verdict == "good" and math.isfinite(o.adduction)]
-        probes = "–"
-        if at:
-            median, late = np.percentile(at, [50, 99])
-            probes = f"{median:g} ({late:g}, {max(at)})"
         angle = f"{np.mean(angles):.1f} ± {np.std(angles):.1f}°" if angles else "–"
-        cells = (*(str(count[kind]) for kind in VERDICTS[1:]), probes, angle)
-        rows.append(f"{name:{width}}  {len(found):>6}  {good:>21}" + _cells(cells, heads[1:]))
-    rows.append("probes to balance: median (99th percentile, worst)")
+        cells = (*(str(count[kind]) for kind in VERDICTS[1:]), _probes(at), angle)
+        rows.append(
+            f"{name:{width}}  {len(found):>6}  {good:>21}  {secure:>21}" + _cells(cells, heads)
+        )
+    rows.append(f"secure: a friction of {SECURE:g} holds what the trial ends in")
+    for name, found in studies.items():
+        if found[0].secure is None:
+            continue
+        at = [outcome.secure_at for outcome in found if outcome.secure_at is not None]
+        since = [outcome.secure_since for outcome in found if outcome.secure_since is not None]
+        lost = _share(sum(o.secure_at is not None and not o.secure for o in found), len(found))
+        rows.append(
+            f"{name}: secure once {_share(len(at), len(found))}, first at probe {_probes(at)}, "
+            f"to the end from {_probes(since)}; once and not at the end {lost}"
+        )
+    rows.append("probes: median (99th percentile, worst)")
     for one, other in combinations(studies, 2):
         rows.append(_compared(one, other, studies[one], studies[other]))
     for name, found in studies.items():
@@ -140,6 +168,20 @@ def report(folders: Sequence[str | Path]) -> str:
                 rest = ", ".join(str(outcome.trial) for outcome in failed[SHOWN:])
                 rows.append(f"{kind}: and trials {rest}")
     return "\n".join(rows)
+
+
+def _share(count: int, total: int) -> str:
+    """A count, and Wilson's interval of its share."""
+    low, high = interval(count, total)
+    return f"{count} [{low:.1%}, {high:.1%}]"
+
+
+def _probes(at: Sequence[int]) -> str:
+    """Median, 99th percentile and worst of the probes at which something came."""
+    if not at:
+        return "–"
+    median, late = np.percentile(at, [50, 99])
+    return f"{median:g} ({late:g}, {max(at)})"
 
 
 def _compared(one: str, other: str, first: list[Outcome], second: list[Outcome]) -> str:

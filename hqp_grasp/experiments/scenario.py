@@ -18,7 +18,7 @@ import tyro
 
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
-from hqp_grasp.control.settling import BEYOND
+from hqp_grasp.control.settling import BEYOND, SECURE
 from hqp_grasp.errors import HqpGraspError, InputError, ResultsError, TrialError
 from hqp_grasp.experiments.plain import speak_plainly
 from hqp_grasp.experiments.plots import convergence
@@ -28,7 +28,10 @@ from hqp_grasp.experiments.record import (
     TRUE_COLUMNS,
     VERDICTS,
     balanced,
+    holds,
+    known,
     says_something,
+    secures,
     verdicts,
 )
 from hqp_grasp.experiments.replay import frames_of_rows, need_viser, rows_of, write_replay
@@ -41,7 +44,8 @@ from hqp_grasp.world.scene import Scene
 
 # What the table on screen and the figure are made of.
 COLUMNS = (
-    *("trial", "probe", "rejected", "error", "eps_f", "eps_m", "eps_k", "adduction_deg"),
+    *("trial", "probe", "rejected", "error", "unbalanced"),
+    *("eps_f", "eps_m", "eps_k", "friction_demand", "adduction_deg"),
     *("elevation_deg", "in_contact", "other_links", "in_transit", "step_share"),
     *("limit_active", "limit_violation", "hqp_projection_gap", "method"),
 )
@@ -239,7 +243,7 @@ def replay_command(scene: Scene, settings: Settings, trial: int) -> str:
 
 def summary(table: pa.Table) -> str:
     """What came of the trials, for people."""
-    texts = ("other_links", "in_transit", "method", "error")
+    texts = ("other_links", "in_transit", "method", "error", "unbalanced")
     columns = {n: table[n].to_numpy() for n in COLUMNS if n not in texts}
     trials = len(np.unique(columns["trial"]))
     shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
@@ -279,6 +283,16 @@ def summary(table: pa.Table) -> str:
     others = " · ".join(f"{kind} {verdict[kind]}" for kind in VERDICTS if kind != "good")
     lines.append(f"good{verdict['good']:11} of {trials} in every respect")
     lines.append(f"         {others}")
+    secure = sum(secures(table).values())
+    demand = known(table, "friction_demand").reshape(trials, -1)[touched[:, -1], -1]
+    lines.append(
+        f"secure{secure:9} of {trials} at the end: they need a friction of {SECURE:g} at most"
+        + (f"; the median {holds(float(np.median(demand)))}" if len(demand) else "")
+    )
+    first_rows = table.filter(pc.equal(table["probe"], 0))
+    reasons = Counter(first_rows["unbalanced"].drop_null().to_pylist()).most_common(1)
+    if reasons:
+        lines.append(f"         not balanced, most often ({reasons[0][1]}): {reasons[0][0]}")
     ended = table.filter(pc.and_(pc.is_valid(table["error"]), pc.equal(table["probe"], 0)))
     errors = ended["error"].to_pylist()
     if errors:

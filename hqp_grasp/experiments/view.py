@@ -8,7 +8,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.fingerprint import Fingerprint
 from hqp_grasp.experiments.plots import ANGLE, FLOOR, FORCE, MOMENT
-from hqp_grasp.experiments.record import VERDICTS, verdicts
+from hqp_grasp.experiments.record import VERDICT_COLUMNS, VERDICTS, holds, secures, verdicts
 from hqp_grasp.experiments.replay import (
     Drawing,
     Frame,
@@ -42,28 +42,29 @@ CURVES = (  # column, colour, what is plotted of it
     ("eps_k", ANGLE, float),
 )
 LABELS = ("ε_f [N²]", "√ε_m [mm·N]", "ε_k [rad]")
-READ = (  # columns that verdicts and sliders need
-    *("trial", "probe", "seed", "in_contact", "other_links", "limit_violation", "error"),
-    *("eps_f", "eps_m", "eps_f_true", "eps_m_true"),
-)
+READ = ("trial", "probe", "seed", "error", *VERDICT_COLUMNS)  # for verdicts and sliders
 LISTED = 24  # failures of a kind that get a button each
 PLAY_SECONDS = 0.5  # a probe, while playing
-SHOWN = {  # columns of a row and how they read, where the row has them
-    "outcome": "{}",
-    "eps_f": "{:.3e} N²",
-    "eps_m": "{:.3e} (N·m)²",
-    "eps_k": "{:.4f} rad",
-    "eps_k_eq7": "{:.4f} m/rad",
-    "adduction_deg": "{:.2f}°",
-    "elevation_deg": "{:.2f}°",
-    "step_share": "{:g}",
-    "limit_active": "{}",
-    "limit_violation": "{:g} rad",
-    "hqp_projection_gap": "{:.1e} rad",
-    "other_links": "{}",
-    "method": "{}",
-    "solve_us": "{:.0f} µs",
-    "error": "{}",
+SHOWN: Mapping[
+    str, Callable[[Any], str]
+] = {  # columns of a row and how they read, where the row has them
+    "outcome": "{}".format,
+    "eps_f": "{:.3e} N²".format,
+    "eps_m": "{:.3e} (N·m)²".format,
+    "eps_k": "{:.4f} rad".format,
+    "eps_k_eq7": "{:.4f} m/rad".format,
+    "friction_demand": holds,
+    "friction_demand_true": holds,
+    "adduction_deg": "{:.2f}°".format,
+    "elevation_deg": "{:.2f}°".format,
+    "step_share": "{:g}".format,
+    "limit_active": "{}".format,
+    "limit_violation": "{:g} rad".format,
+    "hqp_projection_gap": "{:.1e} rad".format,
+    "other_links": "{}".format,
+    "method": "{}".format,
+    "solve_us": "{:.0f} µs".format,
+    "error": "{}".format,
 }
 
 
@@ -77,6 +78,7 @@ class Results:
     probes: int  # after the first touch, in each trial
     seed: int
     failures: Mapping[str, tuple[int, ...]]  # trials by VERDICTS, those that are not good
+    secure: int | None  # trials that end secure; None in a folder from before friction demands
     same_scene: bool  # False where the robot's files or MuJoCo are not those of the study
 
     @classmethod
@@ -97,6 +99,8 @@ class Results:
             file = pq.ParquetFile(folder / "probes.parquet")
             table = file.read([n for n in READ if n in file.schema_arrow.names])
             verdict = verdicts(table)
+            told = "friction_demand" in table.column_names
+            secure = sum(secures(table).values()) if told else None
             trials, probes = (int(pc.max(table[name]).as_py()) for name in ("trial", "probe"))
             seed = int(table["seed"][0].as_py())
         except (ValueError, KeyError, IndexError, TypeError, pa.ArrowException) as error:
@@ -107,7 +111,7 @@ class Results:
             for kind in VERDICTS
             if kind != "good"
         }
-        return cls(folder, scene, trials + 1, probes, seed, failures, there == here)
+        return cls(folder, scene, trials + 1, probes, seed, failures, secure, there == here)
 
     def rows(self, trial: int) -> list[dict[str, Any]]:
         """The rows of one trial, in order."""
@@ -224,7 +228,9 @@ class Viewer:
         bad = sum(map(len, results.failures.values()))
         lines = [
             f"**{results.folder}**: {results.trials} trials of {results.probes} probes, "
-            f"{results.trials - bad} good, seed {results.seed}"
+            f"{results.trials - bad} good, "
+            + ("" if results.secure is None else f"{results.secure} secure, ")
+            + f"seed {results.seed}"
         ]
         if self._other is not None:
             lines.append(f"ghost: **{self._other.folder}**, the same starts")
@@ -263,10 +269,10 @@ def _numbers(
         f"{results.folder.name}{' (ghost)' if i else ''}" for i, (results, _) in enumerate(columns)
     )
     lines = [f"| trial {trial}, probe {probe} |{head}|", "|---|" + "---|" * len(columns)]
-    for name, form in SHOWN.items():
+    for name, said in SHOWN.items():
         values = [None if row is None else row.get(name) for _, row in columns]
         if any(value not in (None, "") for value in values):
-            cells = "|".join("–" if v in (None, "") else form.format(v) for v in values)
+            cells = "|".join("–" if v in (None, "") else said(v) for v in values)
             lines.append(f"| {name} |{cells}|")
     return "\n".join(lines)
 

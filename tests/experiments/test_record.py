@@ -19,13 +19,16 @@ from hqp_grasp.experiments.record import (
     Record,
     empty_row,
     felt_row,
+    holds,
     kind_and_message,
     law_columns,
+    secures,
     verdicts,
 )
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Miss, Missed, Touch
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.mechanics import friction_demand
 from hqp_grasp.tasks import ContactTask, ForceTask, KinematicTask, MomentTask, Stack
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Scene
@@ -58,6 +61,7 @@ def made(force, moment=None, **settings):
     rows = []
     for f, m in zip(force, moment or [0.0] * len(force), strict=True):
         row = dict.fromkeys(COLUMNS) | {"eps_f": f, "eps_m": m, "in_contact": f is not None}
+        row["friction_demand"] = None if f is None else 0.1
         rows.append(row | {"other_links": "", "limit_violation": 0.0})
     return Record((0,), tuple(rows), (), 0, (), **settings)
 
@@ -374,3 +378,89 @@ def test_where_what_is_felt_is_not_what_is_the_true_errors_count():
         | {"other_links": "", "limit_violation": 0.0, "eps_f_true": 0.1, "eps_m_true": 0.0}
     ]
     assert verdicts(pa.Table.from_pylist(rows)) == {0: "not balanced"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "secure"),
+    [
+        ([{}, {}, {}], True),
+        ([{"friction_demand": 1.0}, {"friction_demand": np.inf}, {}], True),  # the end counts
+        ([{}, {}, {"friction_demand": 0.2}], True),
+        ([{}, {}, {"friction_demand": 0.201}], False),
+        ([{}, {}, {"friction_demand": np.inf}], False),
+        ([{}, {}, {"friction_demand": None, "in_contact": False}], False),
+        ([{}, {"other_links": "palm"}, {}], False),
+        ([{"other_links": "palm"}, {}, {"eps_f": 1.0}], True),  # neither start nor balance counts
+        ([{}, {"limit_violation": 1e-12}, {}], False),
+        ([{"error": "E: x"}, {"error": "E: x"}, {"error": "E: x"}], False),
+    ],
+)
+def test_a_trial_is_secure_if_little_friction_holds_its_last_grasp(changes, secure):
+    fine = {"trial": 3, "in_contact": True, "eps_f": 0.0, "eps_m": 0.0, "other_links": ""}
+    fine |= {"limit_violation": 0.0, "error": None, "friction_demand": 0.1}
+    rows = [{**fine, "probe": i, **change} for i, change in enumerate(changes)]
+    table = pa.Table.from_pylist(rows[::-1])
+    assert secures(table) == {3: secure}
+    # What is felt does not count where what is is known.
+    true = pa.array([row["friction_demand"] for row in rows[::-1]], pa.float64())
+    at = table.column_names.index("friction_demand")
+    felt = table.set_column(at, "friction_demand", pa.array([1.0] * len(rows)))
+    assert secures(felt.append_column("friction_demand_true", true)) == {3: secure}
+
+
+def test_every_touch_has_its_friction_demand_and_a_record_its_verdicts(record):
+    for row, grasp in felt(record):
+        assert row["friction_demand"] == friction_demand(grasp.positions, grasp.normals)
+    assert record.secure is (record.rows[-1]["friction_demand"] <= 0.2)
+    assert made([1.0, 1.0]).secure and made([1.0, 1.0]).verdict == "not balanced"
+    assert not made([0.0, None], [0.0, None]).secure
+
+
+def test_a_friction_demand_reads_as_what_holds():
+    assert holds(0.0567) == "holds if µ ≥ 0.06"
+    assert holds(np.inf) == "no friction holds it"
+
+
+def on_cone(lean, turns, axis):
+    """Grasps of three on a cone about `axis` (3,), whose walls lean by `lean` [rad]."""
+    frame = np.linalg.qr(np.column_stack([axis, np.eye(3)[:, :2]]))[0]
+    frame *= np.sign(frame[:, 0] @ axis)
+    grasps = []
+    for turn in turns:
+        t = turn + np.array([0.0, 1.9, 4.1])
+        n = np.column_stack(
+            [np.full(3, np.sin(lean)), *(np.cos(lean) * f(t) for f in (np.cos, np.sin))]
+        )
+        contacts = [Contact(0.05 * v, v) for v in n @ frame.T]
+        grasps.append(Grasp(np.zeros(2), contacts, np.zeros((9, 2))))
+    return grasps
+
+
+@pytest.mark.parametrize("axis", [[0.0, 0.0, 1.0], [0.0, 0.6, -0.8]])
+def test_walls_that_lean_are_told_by_their_angle(axis):
+    def told(*grasps):
+        return dataclasses.replace(made([1.0, 1.0]), grasps=grasps).unbalanced
+
+    for degrees in (1.0, 3.0, 15.5):
+        grasps = on_cone(np.radians(degrees), range(8), np.array(axis))
+        said = f"walls lean by about {degrees:.0f}°: equal forces cannot balance"
+        assert told(*grasps) == said
+        # A rim that was touched now and then is no wall.
+        rim = dataclasses.replace(grasps[0].contacts[0], normal=np.array(axis))
+        odd = dataclasses.replace(grasps[0], contacts=(rim, *grasps[0].contacts[1:]))
+        assert told(odd, odd, *grasps) == said
+    # 0.5° leaves less than a balanced grasp may have: balance was there to be found.
+    upright = on_cone(np.radians(0.5), range(8), np.array(axis))
+    assert told(*upright) == "no grasp was found whose forces balance"
+
+
+def test_why_a_trial_does_not_balance_is_told_once_and_only_then(record):
+    table = record.to_table()
+    assert table["unbalanced"].to_pylist() == [record.unbalanced] * (PROBES + 1)
+    grasps = on_cone(0.0, range(3), np.array([0.0, 0.0, 1.0]))
+    for force, moment, said in (
+        ([1.0, 0.0], [1.0, 0.0], None),
+        ([0.0, 0.0], [0.0, 1.0], "no grasp was found whose moments balance"),
+        ([0.0, None], [0.0, None], "the object is not touched at the end"),
+    ):
+        assert dataclasses.replace(made(force, moment), grasps=tuple(grasps)).unbalanced == said

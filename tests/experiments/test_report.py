@@ -37,6 +37,7 @@ def write(folder, trials, **columns):
                     "in_contact": touched,
                     "other_links": "",
                     "limit_violation": 0.0,
+                    "friction_demand": 0.1 if touched else None,
                     "error": None,
                     "adduction_deg": 50.0 + number if touched else None,
                     "outcome": "touch" if touched else "missed",
@@ -83,6 +84,27 @@ def test_true_errors_decide_where_they_are_known(tmp_path):
         table = table.append_column(name, pa.array([value] * len(table)))
     pq.write_table(table, folder / "probes.parquet")
     assert outcomes(folder)[0].verdict == "not balanced"
+
+
+def test_secure_trials_stand_beside_good_ones_with_those_that_were_so_once(tmp_path):
+    demands = ([0.5, 0.1, 0.3, 0.1], [0.1, 0.1, 0.1, 0.3], [0.9] * 4, [0.1] * 4)
+    folder = write(tmp_path / "a", [[OFF] * 4] * 4)
+    table = pq.read_table(folder / "probes.parquet")
+    at = table.column_names.index("friction_demand")
+    keys = zip(table["trial"].to_pylist(), table["probe"].to_pylist(), strict=True)
+    values = pa.array([demands[trial][probe] for trial, probe in keys])
+    pq.write_table(table.set_column(at, "friction_demand", values), folder / "probes.parquet")
+    found = outcomes(folder)
+    assert [o.secure for o in found] == [True, False, False, True]
+    assert [o.secure_at for o in found] == [1, 0, None, 0]
+    assert [o.secure_since for o in found] == [3, None, None, 0]
+    said = report([folder])
+    assert "2 [15.0%, 85.0%]" in said  # of four
+    assert "secure once 3 [30.1%, 95.4%], first at probe 0 (0.98, 1)" in said
+    assert "to the end from 1.5 (2.97, 3); once and not at the end 1 [4.6%, 69.9%]" in said
+    # A folder from before friction demands tells the rest.
+    pq.write_table(table.drop_columns(["friction_demand"]), folder / "probes.parquet")
+    assert outcomes(folder)[0].secure is None and "secure once" not in report([folder])
 
 
 @pytest.mark.parametrize(("count", "total"), [(0, 10), (10, 10), (878, 1000), (1, 3)])
