@@ -26,16 +26,6 @@ def blas_threads():
 
 
 @dataclass(frozen=True)
-class OneThreadTask(ForceTask):
-    """The force law, in processes with one BLAS thread only."""
-
-    def error(self, grasp):
-        if blas_threads() != "1":
-            raise RuntimeError(f"{blas_threads()} BLAS threads")
-        return super().error(grasp)
-
-
-@dataclass(frozen=True)
 class ManyThreadsTask(ForceTask):
     """The force law, never in a worker of a study."""
 

@@ -30,6 +30,14 @@ def run(cwd, *arguments):
     )
 
 
+def call(monkeypatch, module, *arguments):
+    """Do in this process what `python -m hqp_grasp.scenarios.MODULE ARGUMENTS` does."""
+    module = f"hqp_grasp.scenarios.{module}"
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setattr(sys, "argv", [module, *arguments])
+    runpy.run_module(module, run_name="__main__")
+
+
 def test_there_is_a_scenario_for_every_object_of_the_paper_and_for_files():
     names = {path.stem for path in FOLDER.glob("*.py")} - {"__init__"}
     assert names == {*OBJECTS, *FROM_FILES}
@@ -64,7 +72,9 @@ def test_an_outline_off_the_origin_is_recentred_and_told(tmp_path):
     assert pq.read_table(tmp_path / "results" / "probes.parquet").num_rows == 3
 
 
-def test_an_object_runs_from_its_file_and_results_of_another_are_not_continued(tmp_path):
+def test_an_object_runs_from_its_file_and_results_of_another_are_not_continued(
+    tmp_path, monkeypatch
+):
     geom = "<geom type='cylinder' size='{} 0.06'/>"
     body = f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>"
     command = ("-m", "hqp_grasp.scenarios.object", "--object", "can.xml", *TINY)
@@ -73,8 +83,9 @@ def test_an_object_runs_from_its_file_and_results_of_another_are_not_continued(t
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("object-can: force ▷ moment ▷ kinematic")
     (tmp_path / "can.xml").write_text(body.format(0.04))
-    done = run(tmp_path, *command)
-    assert done.returncode == 1 and "content" in done.stderr
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="content"):
+        call(monkeypatch, "object", "--object", "can.xml", *TINY)
 
 
 @pytest.mark.parametrize(
@@ -87,10 +98,14 @@ def test_an_object_runs_from_its_file_and_results_of_another_are_not_continued(t
         ("object", "--object", "o.xml", None, "object-o: no file"),
     ],
 )  # fmt: skip
-def test_a_bad_file_costs_one_line_and_no_work(tmp_path, script, option, name, text, message):
+def test_a_bad_file_costs_one_line_and_no_work(
+    tmp_path, monkeypatch, capsys, script, option, name, text, message
+):
     if text is not None:
         (tmp_path / name).write_text(text)
-    done = run(tmp_path, FOLDER / f"{script}.py", option, name, *TINY)
-    assert done.returncode == 1 and done.stdout == ""
-    assert message in done.stderr and len(done.stderr.splitlines()) == 1
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        call(monkeypatch, script, option, name, *TINY)
+    assert capsys.readouterr() == ("", "")
+    assert message in end.value.code and len(end.value.code.splitlines()) == 1
     assert not (tmp_path / "results").exists()

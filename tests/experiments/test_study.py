@@ -8,7 +8,7 @@ import shutil
 
 import pyarrow.parquet as pq
 import pytest
-from own_law import ManyThreadsTask, OneThreadTask
+from own_law import ManyThreadsTask
 
 from hqp_grasp.control.controller import Controller
 from hqp_grasp.errors import (
@@ -317,22 +317,18 @@ def test_a_strict_study_stops_at_the_first_failure_with_the_rest_on_disk(
     assert same(strict.run(out), done[1])
 
 
-def test_a_strict_study_stops_in_several_processes_too(trial, tmp_path):
+def test_every_worker_has_one_blas_thread_and_a_strict_study_stops_there_too(
+    trial, tmp_path, monkeypatch
+):
     """The law refuses the one BLAS thread that every worker has."""
+    for name in executor.THREADS:
+        monkeypatch.delenv(name, raising=False)
     broken = dataclasses.replace(trial, stack=ManyThreadsTask())
     study = Study(broken, 8, SEED, jobs=2, strict=True)
     with pytest.raises(TrialError, match="1 BLAS threads; raised by the law 'manythreads'"):
         study.run(tmp_path / "results")
     errors = pq.read_table(tmp_path / "results" / "probes.parquet").column("error")
     assert errors.null_count == 0 and len(errors) > 0
-
-
-def test_every_worker_has_one_blas_thread(trial, tmp_path, monkeypatch):
-    for name in executor.THREADS:
-        monkeypatch.delenv(name, raising=False)
-    one = dataclasses.replace(trial, stack=OneThreadTask(), probes=1)
-    table = Study(one, 2, SEED, jobs=2).run(tmp_path / "results")
-    assert table.column("error").null_count == table.num_rows
     assert not any(name in os.environ for name in executor.THREADS)
 
 
