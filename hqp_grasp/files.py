@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -29,6 +31,11 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         if isinstance(error, OSError) and not isinstance(error, HqpGraspError):
             raise ResultsError(f"{path} cannot be written: {error.strerror or error}") from error
         raise
+
+
+def digest(plain: object) -> bytes:
+    """SHA-256 of what JSON can hold; the same for what JSON has held."""
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).digest()
 
 
 def sweep(folder: Path) -> None:

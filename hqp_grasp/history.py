@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hqp_grasp.errors import ResultsError
-from hqp_grasp.files import whole_file
+from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.files import digest, whole_file
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 
 FORMER = ("confidence",)  # of contacts in older files; nothing ever read it
+# What comes of JSON that holds something else.
+UNREADABLE = (*(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError),)
 GRASP = ("q", "jacobian", "hessian", "rolling", "coupling", "offset")
 
 
@@ -21,20 +23,48 @@ def save_history(path: str | Path, history: Sequence[Touch]) -> None:
 
     Raises ResultsError where the file cannot be written.
     """
-    text = json.dumps([_plain(touch) for touch in history])
+    touches = [_plain(touch) for touch in history]
+    _require_one_hand(history)
+    text = json.dumps({"sha256": digest(touches).hex(), "touches": touches})
     with whole_file(path) as part:
         part.write_text(text)
 
 
 def load_history(path: str | Path) -> tuple[Touch, ...]:
-    """Read what `save_history` wrote; raise ResultsError where it is something else."""
+    """Read what `save_history` wrote; raise ResultsError where it is something else, or damaged.
+
+    Older files are a list of touches, without a checksum.
+    """
     try:
-        touches = json.loads(Path(path).read_text())
-        return tuple(_touch(touch) for touch in touches)
+        text = json.loads(Path(path).read_text())
+        told, touches = (
+            (str(text["sha256"]), text["touches"]) if isinstance(text, dict) else (None, text)
+        )
+        history = tuple(_touch(touch) for touch in touches)
+        _require_one_hand(history)
     except OSError as error:
         raise ResultsError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except UNREADABLE as error:
         raise ResultsError(f"{path} is no history of touches: {error!r}") from error
+    if told is not None and told != digest(touches).hex():
+        raise ResultsError(f"{path} is damaged: its checksum does not fit its touches")
+    return history
+
+
+def _require_one_hand(history: Sequence[Touch]) -> None:
+    """Raise InputError unless all touches are of the same joints, and the same contacts."""
+    joints = {len(touch.q_target) for touch in history}
+    if len(joints) > 1:
+        raise InputError(f"its touches are of hands with {sorted(joints)} joints")
+    grasps = ((i, touch.felt) for i, touch in enumerate(history) if isinstance(touch.felt, Grasp))
+    felt = {i: [(contact.name, contact.body) for contact in g.contacts] for i, g in grasps}
+    first = next(iter(felt), None)
+    for i, names in felt.items():
+        if names != felt[first]:  # type: ignore[index]
+            raise InputError(
+                f"touch {i} felt {len(names)} contacts {names}, touch {first} "
+                f"{len(felt[first])} {felt[first]}: a history is of one hand"  # type: ignore[index]
+            )
 
 
 def _plain(touch: Touch) -> dict[str, object]:

@@ -66,7 +66,7 @@ WRITERS = {
     "scene.json": lambda path, table: SCENE.save(path),
     "convergence.png": lambda path, table: convergence(table, "a", path),
     "robot.png": lambda path, table: draw(SCENE.articulated, path),
-    "trial_000000.parquet": lambda path, table: Parts(path.parent).add(0, table),
+    "trial_000000.parquet": lambda path, table: Parts(path.parent, table, bytes(32)).add(0, table),
 }
 
 

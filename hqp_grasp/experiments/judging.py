@@ -11,11 +11,11 @@ from typing import ClassVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from hqp_grasp.control.forces import Grip
 from hqp_grasp.errors import InputError, ResultsError
-from hqp_grasp.experiments.record import kind_and_message
+from hqp_grasp.experiments.parts import read_results
+from hqp_grasp.experiments.record import ALL_HAVE, kind_and_message
 from hqp_grasp.experiments.replay import frames_of_rows, placed, rows_of
 from hqp_grasp.experiments.report import interval
 from hqp_grasp.experiments.study import Study
@@ -88,13 +88,12 @@ class Judging:
         """
         folder = Path(folder)
         scene = Scene.load(folder / "scene.json")
+        needed = ALL_HAVE | {"outcome": "texts"}
         try:
-            table = pq.read_table(folder / "probes.parquet")
-        except (pa.ArrowException, OSError) as error:
+            table = read_results(folder / "probes.parquet", needed)
+        except ResultsError as error:
             raise ResultsError(f"{folder} holds no results to judge: {error}") from error
         trials = sorted(set(table["trial"].to_pylist()))
-        if not trials:
-            raise ResultsError(f"{folder} has no trials to judge")
         if trials != list(range(len(trials))):
             raise ResultsError(f"{folder} lacks trials before {trials[-1]}; run its study again")
         found = tuple(_found(scene, rows_of(table, i), probe) for i in trials)

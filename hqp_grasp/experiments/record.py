@@ -63,6 +63,14 @@ VERDICT_COLUMNS = (  # that verdicts read beside trial, probe and error; the tru
     *("in_contact", "other_links", "limit_violation", "eps_f", "eps_m", "eps_f_true", "eps_m_true"),
     *("friction_demand", "friction_demand_true"),
 )
+# What these and a study's own columns hold, for whoever reads results: those that all have, and
+# those that some have.
+ALL_HAVE = {
+    **{"trial": "whole numbers", "seed": "whole numbers", "probe": "whole numbers"},
+    **{"in_contact": "true or false", "other_links": "texts", "error": "texts"},
+    **{"limit_violation": "numbers", "eps_f": "numbers", "eps_m": "numbers"},
+}
+SOME_HAVE = {name: "numbers" for name in VERDICT_COLUMNS if name not in ALL_HAVE}
 BALANCE_COLUMNS = ("eps_f", "eps_m", "floor_f", "floor_m")
 # The columns that say the same in every row of a trial.
 TRIAL_COLUMNS = {

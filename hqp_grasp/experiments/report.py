@@ -10,15 +10,15 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from hqp_grasp.control.settling import SECURE
 from hqp_grasp.errors import InputError, ResultsError
+from hqp_grasp.experiments.parts import read_results
 from hqp_grasp.experiments.record import (
+    ALL_HAVE,
     CONVERGED_FORCE,
     CONVERGED_MOMENT,
-    VERDICT_COLUMNS,
+    SOME_HAVE,
     VERDICTS,
     ends,
     floats,
@@ -30,7 +30,6 @@ from hqp_grasp.experiments.record import (
 
 Z = 1.96  # standard deviations of a 95 % interval
 SHOWN = 5  # trials named of each kind of failure
-COLUMNS = ("trial", "seed", "probe", "error", "adduction_deg", *VERDICT_COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -50,17 +49,16 @@ class Outcome:
 def outcomes(folder: str | Path) -> list[Outcome]:
     """Every trial of a results folder, in order; raise ResultsError where there is none."""
     path = Path(folder) / "probes.parquet"
+    if not path.exists():
+        raise ResultsError(f"{folder} has no probes.parquet: it is no results folder")
+    needed = ALL_HAVE | {"adduction_deg": "numbers"}
     try:
-        have = pq.read_schema(path).names
-        table = pq.read_table(path, columns=[name for name in COLUMNS if name in have])
-    except FileNotFoundError as error:
-        raise ResultsError(f"{folder} has no probes.parquet: it is no results folder") from error
-    except (pa.ArrowException, OSError) as error:
+        table = in_order(read_results(path, needed, SOME_HAVE))
+    except ResultsError as error:
         raise ResultsError(f"{path} is broken ({error}); run its scenario again") from error
-    table = in_order(table)
     verdict, secure = verdicts(table), {}
     demand = np.full(len(table), np.nan)
-    if "friction_demand" in have:
+    if "friction_demand" in table.column_names:
         secure, demand = secures(table), known(table, "friction_demand")
     trial, seed = (table[name].to_numpy() for name in ("trial", "seed"))
     force, moment = (known(table, name) for name in ("eps_f", "eps_m"))

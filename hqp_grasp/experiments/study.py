@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -26,8 +27,8 @@ from hqp_grasp.errors import (
 )
 from hqp_grasp.experiments.executor import DEATHS, address_of, pickled, run_all, tell
 from hqp_grasp.experiments.fingerprint import Fingerprint, cpu_kind, differences
-from hqp_grasp.experiments.parts import Parts
-from hqp_grasp.files import sweep, whole_file
+from hqp_grasp.experiments.parts import Parts, sealed
+from hqp_grasp.files import PART, digest, sweep, whole_file
 from hqp_grasp.world.scene import Scene
 
 STUDY_COLUMNS = {
@@ -61,7 +62,7 @@ class Repeatable(Protocol):
         ...
 
     def nothing(self, seed: Sequence[int], error: str) -> Rows:
-        """The rows of a trial of which nothing is known but what ended it."""
+        """The rows of a trial of which nothing is known but what ended it: as many as of any."""
         ...
 
 
@@ -117,11 +118,13 @@ class Study:
         out, whole = Path(out), Path(out) / self.trial.file
         if self.jobs > 1 and self.trials > 1 and self.cluster is None:
             pickled(_Work(self.trial, self.seed))  # raises, before there is a folder
-        with _claimed(out, self.configuration()) as folder:
+        configuration = self.configuration()
+        like = _table(self.trial.nothing((self.seed, 0), "not run"), 0, self.seed)
+        with _claimed(out, configuration) as folder:
             self.trial.scene.save(out / "scene.json")  # for whoever draws it
-            parts = Parts(folder)
+            parts = Parts(folder, like, digest(configuration))
             for name in parts.broken:
-                tell(f"{folder / name} cannot be read: set aside, and what was in it runs again")
+                tell(f"{folder / name} cannot be used: set aside, and what was in it runs again")
             failed = self._run_missing(parts, out)
             parts.merge(whole)
         if failed is not None:
@@ -194,19 +197,10 @@ def _claimed(out: Path, configuration: dict[str, object]) -> Iterator[Path]:
         parts.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=parts):
             pass
-        for folder in (out, parts):
-            sweep(folder)
+        held = os.open(parts, os.O_RDONLY)
     except OSError as error:
         raise ResultsError(f"{out} cannot be written: {error.strerror or error}") from error
-    config = out / "config.json"
-    if config.exists():
-        _compare(out, _described(config), configuration)
-    elif any(parts.iterdir()):
-        raise ResultsError(f"{out} holds results without a config.json; take another folder")
-    else:
-        with whole_file(config) as fresh:
-            fresh.write_text(json.dumps(configuration, indent=2) + "\n")
-    with config.open() as held:
+    try:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -214,18 +208,66 @@ def _claimed(out: Path, configuration: dict[str, object]) -> Iterator[Path]:
                 f"{out} is being written by another run; wait until it ends"
             ) from None
         except OSError as error:
-            raise ResultsError(f"{config} cannot be locked: {error.strerror or error}") from error
+            raise ResultsError(f"{parts} cannot be locked: {error.strerror or error}") from error
+        _sweep(out, parts)
+        _require_same(out, parts, configuration)
         yield parts
+    finally:
+        os.close(held)
 
 
-def _described(config: Path) -> dict[str, object]:
+def _sweep(out: Path, parts: Path) -> None:
+    """Remove what runs left that died while they wrote."""
     try:
-        return json.loads(config.read_text())
-    except ValueError as error:
-        raise ResultsError(
-            f"{config} cannot be read, so whose results these are cannot be told ({error}); "
-            "take another --out"
-        ) from error
+        sweep(out)
+        # Nobody but us writes these, whatever lives under the number of who began them.
+        for folder, names in ((parts, "*"), (out, "*.json.*"), (out, "*.parquet.*")):
+            for left in folder.glob(f"{names}{PART}"):
+                left.unlink(missing_ok=True)
+    except OSError as error:
+        raise ResultsError(f"{out} cannot be written: {error.strerror or error}") from error
+
+
+def _require_same(out: Path, parts: Path, configuration: dict[str, object]) -> None:
+    """Raise ResultsError unless what lies in `out`, if anything, is of this configuration."""
+    config, of = out / "config.json", digest(configuration)
+    if config.exists():
+        there = _described(config)
+        if there is not None:
+            _compare(out, there, configuration)
+            return
+        # The parts say what they are of, too.
+        if configuration["unknown"] or of not in map(_owner, parts.glob("*.parquet")):
+            raise ResultsError(
+                f"{config} cannot be read, was changed, or is of an older hqp_grasp, and no file "
+                f"in {parts} says that it is of this configuration; take another --out"
+            )
+        config.replace(config.with_suffix(".broken"))
+        tell(f"{config} cannot be read or was changed: set aside, and written again")
+    elif any(parts.iterdir()):
+        raise ResultsError(f"{out} holds results without a config.json; take another folder")
+    with whole_file(config) as fresh:
+        fresh.write_text(json.dumps(configuration | {"sha256": of.hex()}, indent=2) + "\n")
+
+
+def _described(config: Path) -> dict[str, object] | None:
+    """What a folder says that it holds; None where that is not what was written."""
+    try:
+        there = json.loads(config.read_text())
+    except (ValueError, RecursionError):
+        return None
+    except OSError as error:
+        raise ResultsError(f"{config} cannot be read: {error.strerror or error}") from error
+    told = there.pop("sha256", None) if isinstance(there, dict) else None
+    return there if told is not None and told == digest(there).hex() else None
+
+
+def _owner(part: Path) -> bytes | None:
+    """What configuration a part is of; None where it does not say, or is damaged."""
+    try:
+        return sealed(part)
+    except ResultsError:
+        return None
 
 
 def _compare(out: Path, there: dict[str, object], here: dict[str, object]) -> None:

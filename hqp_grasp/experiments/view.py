@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.fingerprint import Fingerprint
+from hqp_grasp.experiments.parts import read_results
 from hqp_grasp.experiments.plots import ANGLE, FLOOR, FORCE, MOMENT
-from hqp_grasp.experiments.record import VERDICT_COLUMNS, VERDICTS, holds, secures, verdicts
+from hqp_grasp.experiments.record import ALL_HAVE, SOME_HAVE, VERDICTS, holds, secures, verdicts
 from hqp_grasp.experiments.replay import (
     Drawing,
     Frame,
@@ -42,7 +42,7 @@ CURVES = (  # column, colour, what is plotted of it
     ("eps_k", ANGLE, float),
 )
 LABELS = ("ε_f [N²]", "√ε_m [mm·N]", "ε_k [rad]")
-READ = ("trial", "probe", "seed", "error", *VERDICT_COLUMNS)  # for verdicts and sliders
+READ = ALL_HAVE | {"outcome": "texts", "eps_k": "numbers"}  # for verdicts, sliders and curves
 LISTED = 24  # failures of a kind that get a button each
 PLAY_SECONDS = 0.5  # a probe, while playing
 SHOWN: Mapping[
@@ -96,15 +96,14 @@ class Results:
         scene = Scene.load(folder / "scene.json")
         try:
             there = json.loads((folder / "config.json").read_text())["trial"]["scene"]
-            file = pq.ParquetFile(folder / "probes.parquet")
-            table = file.read([n for n in READ if n in file.schema_arrow.names])
-            verdict = verdicts(table)
-            told = "friction_demand" in table.column_names
-            secure = sum(secures(table).values()) if told else None
-            trials, probes = (int(pc.max(table[name]).as_py()) for name in ("trial", "probe"))
-            seed = int(table["seed"][0].as_py())
-        except (ValueError, KeyError, IndexError, TypeError, pa.ArrowException) as error:
+            needed = READ | {f"q_{joint}": "numbers" for joint in scene.articulated.joints}
+            table = read_results(folder / "probes.parquet", needed, SOME_HAVE)
+        except (ResultsError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise ResultsError(f"{folder} cannot be read: {error}") from error
+        verdict = verdicts(table)
+        secure = sum(secures(table).values()) if "friction_demand" in table.column_names else None
+        trials, probes = (int(pc.max(table[name]).as_py()) for name in ("trial", "probe"))
+        seed = int(table["seed"][0].as_py())
         here = json.loads(json.dumps(Fingerprint(scene).parts["trial"]))
         failures = {
             kind: tuple(trial for trial, found in sorted(verdict.items()) if found == kind)

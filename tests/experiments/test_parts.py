@@ -12,7 +12,8 @@ import pytest
 from hqp_grasp.experiments import parts as module
 from hqp_grasp.experiments.parts import Parts
 
-ROWS = 3
+ROWS, SEED = 3, 7
+OF = bytes(range(32))  # what stands for the digest of a configuration
 
 
 @pytest.fixture(autouse=True)
@@ -24,6 +25,7 @@ def table(trial, value=0.0, error=None):
     return pa.table(
         {
             "trial": pa.array([trial] * ROWS, pa.int64()),
+            "seed": pa.array([SEED] * ROWS, pa.int64()),
             "probe": pa.array(range(ROWS), pa.int64()),
             "value": pa.array([value + trial] * ROWS),
             "error": pa.array([error] * ROWS, pa.string()),
@@ -31,8 +33,12 @@ def table(trial, value=0.0, error=None):
     )
 
 
+def opened(folder):
+    return Parts(folder, table(0), OF)
+
+
 def added(folder, trials, value=0.0, error=None):
-    parts = Parts(folder)
+    parts = opened(folder)
     for i in trials:
         parts.add(i, table(i, value, error))
     return parts
@@ -61,7 +67,7 @@ def test_all_trials_are_merged_in_order_however_they_came(tmp_path):
     order = [(7 * i) % 23 for i in range(23)]
     parts = added(tmp_path, order)
     assert merged(parts, tmp_path).equals(expected(range(23)))
-    assert merged(Parts(tmp_path), tmp_path).equals(expected(range(23)))
+    assert merged(opened(tmp_path), tmp_path).equals(expected(range(23)))
 
 
 def test_the_whole_is_written_in_row_groups_of_a_batch(tmp_path):
@@ -72,10 +78,10 @@ def test_the_whole_is_written_in_row_groups_of_a_batch(tmp_path):
 
 def test_merging_holds_few_batches_at_a_time(tmp_path, monkeypatch):
     parts = added(tmp_path, range(40))
-    opened, read = [], module._read
-    monkeypatch.setattr(module, "_read", lambda path: opened.append(path) or read(path))
+    reads, read = [], Parts._read
+    monkeypatch.setattr(Parts, "_read", lambda self, path: reads.append(path) or read(self, path))
     merged(parts, tmp_path)
-    assert len(opened) == 10 == len(set(opened))
+    assert len(reads) == 10 == len(set(reads))
 
 
 def test_a_trial_that_ran_again_wins_over_its_batch_and_later_batches_over_earlier(tmp_path):
@@ -85,8 +91,8 @@ def test_a_trial_that_ran_again_wins_over_its_batch_and_later_batches_over_earli
     values = merged(parts, tmp_path)["value"].to_pylist()[::ROWS]
     assert values == [0, 11, 2, 3, 4, 15, 6, 7]
     parts = added(tmp_path, [0, 2, 3, 4], value=20.0)  # makes a batch
-    assert not Parts(tmp_path).is_done(6)
-    values = merged(Parts(tmp_path), tmp_path)["value"].to_pylist()[::ROWS]
+    assert not opened(tmp_path).is_done(6)
+    values = merged(opened(tmp_path), tmp_path)["value"].to_pylist()[::ROWS]
     assert values == [20, 11, 22, 23, 24, 15, 6, 7]
 
 
@@ -94,7 +100,7 @@ def test_a_batch_of_which_every_trial_ran_again_goes(tmp_path):
     added(tmp_path, range(4))
     added(tmp_path, range(4), value=5.0)
     assert names(tmp_path) == ["batch_000000.parquet", "batch_000001.parquet"]
-    parts = Parts(tmp_path)
+    parts = opened(tmp_path)
     assert names(tmp_path) == ["batch_000001.parquet"]
     assert merged(parts, tmp_path).equals(expected(range(4), 5.0))
 
@@ -105,7 +111,7 @@ def test_killed_between_writing_a_batch_and_removing_its_trials_nothing_is_lost_
     singles.add(3, table(3))
     for path, content in kept.items():
         path.write_bytes(content)
-    parts = Parts(tmp_path)
+    parts = opened(tmp_path)
     assert len(parts) == 4
     assert merged(parts, tmp_path).equals(expected(range(4)))
 
@@ -126,7 +132,7 @@ def test_a_broken_file_is_told_and_only_its_trials_are_missing(tmp_path, name, s
         pq.write_table(pa.table({"x": [1]}), path)
         content = path.read_bytes()
     path.write_bytes(content)
-    parts = Parts(tmp_path)
+    parts = opened(tmp_path)
     (told,) = parts.broken
     assert told.startswith(f"{name} (")
     lost = [9] if name.startswith("trial") else [4, 5, 6, 7]
@@ -134,7 +140,7 @@ def test_a_broken_file_is_told_and_only_its_trials_are_missing(tmp_path, name, s
     for i in lost:
         parts.add(i, table(i))
     assert merged(parts, tmp_path).equals(expected(range(10)))
-    assert Parts(tmp_path).broken == []
+    assert opened(tmp_path).broken == []
     assert path.with_suffix(".broken").read_bytes() == content
 
 
@@ -142,7 +148,7 @@ KILLED = """
 import sys; from pathlib import Path; sys.path.insert(0, sys.argv[2])
 import test_parts as t
 t.module.BATCH = 4
-parts = t.Parts(Path(sys.argv[1]))
+parts = t.opened(Path(sys.argv[1]))
 print("ready", flush=True)
 for i in range(10_000):
     parts.add(i, t.table(i))
@@ -159,7 +165,7 @@ def test_killed_at_any_moment_every_file_is_whole(tmp_path):
             with pytest.raises(subprocess.TimeoutExpired):
                 writer.wait(pause)
             writer.send_signal(signal.SIGKILL)
-        parts = Parts(folder)
+        parts = opened(folder)
         done = [i for i in range(10_000) if parts.is_done(i)]
         assert parts.broken == [] and done == list(range(len(done)))
         if done:

@@ -413,7 +413,7 @@ def test_a_broken_part_is_told_and_its_trial_runs_again(done, study, folder, ran
     part.write_bytes(part.read_bytes()[:-9])
     assert same(study.run(folder), done[1])
     assert ran == [1]
-    told = f"{part} (Parquet magic bytes not found"
+    told = f"{part} (it has no seal"
     assert told in capsys.readouterr().err
 
 
@@ -449,12 +449,37 @@ def test_a_folder_that_another_run_writes_is_refused(study, folder, ran):
     study.run(folder)
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"seed": 7'])
-def test_a_config_cut_short_is_refused(study, folder, ran, text):
-    (folder / "config.json").write_text(text)
+DAMAGED = ["", "{", '{"seed": 7', "[7]", "[" * 100_000, "another seed", "no checksum", "\xff"]
+
+
+@pytest.fixture(params=DAMAGED, ids=lambda text: text[:12])
+def damaged(request, folder):
+    """A folder whose config.json is not what was written."""
+    config = folder / "config.json"
+    text = request.param
+    if text == "another seed":
+        text = config.read_text().replace(f'"seed": {SEED}', f'"seed": {SEED + 1}')
+    elif text == "no checksum":
+        text = config.read_text().replace("sha256", "sha257")
+    config.write_text(text, encoding="latin-1")
+    return folder
+
+
+def test_a_damaged_config_is_told_and_written_again_where_a_part_says_whose_it_is(
+    done, study, damaged, ran, capsys
+):
+    assert study.run(damaged).equals(done[1])
+    assert "config.json cannot be read or was changed: set aside" in capsys.readouterr().err
+    assert (damaged / "config.json").read_bytes() == (done[0] / "config.json").read_bytes()
+    assert (damaged / "config.broken").exists() and ran == []
+    study.run(damaged)
+
+
+def test_results_whose_config_is_damaged_are_refused_to_another_study(study, damaged, ran):
+    before = {path: path.read_bytes() for path in damaged.rglob("*.*")}
     with pytest.raises(ResultsError, match=r"config\.json cannot be read, .*another --out"):
-        study.run(folder)
-    assert ran == []
+        dataclasses.replace(study, seed=SEED + 1).run(damaged)
+    assert ran == [] and before == {path: path.read_bytes() for path in damaged.rglob("*.*")}
 
 
 def test_what_is_no_address_of_a_cluster_is_said_before_any_work(trial):
