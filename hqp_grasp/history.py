@@ -13,8 +13,14 @@ from hqp_grasp.files import digest, whole_file
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 
 FORMER = ("confidence",)  # of contacts in older files; nothing ever read it
-# What comes of JSON that holds something else.
-UNREADABLE = (*(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError),)
+UNREADABLE = (  # what comes of JSON that holds something else
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
 GRASP = ("q", "jacobian", "hessian", "rolling", "coupling", "offset")
 
 

@@ -8,13 +8,13 @@ fingertips are −f_i. Normals n_i point out of the object, so that a contact pu
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from hqp_grasp.errors import InputError, SolverError, positive
 from hqp_grasp.grasp import UNIT_NORMAL_TOLERANCE, as_array
+from hqp_grasp.kernels import njit
 
 FLOOR = 0.2  # [–] of the mean normal force that each contact keeps: none only looks on
 FLAT = 1e-9  # [–] singular value that counts as none, where the largest is about 1

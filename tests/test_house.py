@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "hqp_grasp"
 # From the ground up. A file may import from its own folder and from floors below, never from
 # above, nor from another folder of its floor.
 FLOORS = (
-    ("errors",),
+    ("errors", "kernels"),
     ("files",),
     ("grasp",),
     ("mechanics",),

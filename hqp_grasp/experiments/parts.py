@@ -65,9 +65,11 @@ class Parts:
             if named is None:
                 raise ResultsError("no part has such a name")
             table = self._read(path)
-            if named[1] == "trial" and (table["trial"].to_numpy() != int(named[2])).any():
-                raise ResultsError(f"it holds trial {table['trial'][0]}")
+            if named[1] == "trial":
+                _require_only(table, int(named[2]))
         except ResultsError as error:
+            if isinstance(error.__cause__, PermissionError):
+                raise ResultsError(f"{path} cannot be read: {error}") from error
             path.replace(path.with_suffix(".broken"))
             self.broken.append(f"{path.name} ({error})")
             return
@@ -89,6 +91,8 @@ class Parts:
 
     def _require_alike(self, table: pa.Table) -> None:
         """Raise ResultsError unless these are rows of this study's trials, in order."""
+        if not len(table):
+            raise ResultsError("it has no rows")
         found = _unlike(table.schema, self._like.schema)
         if found:
             raise ResultsError(f"its columns are not those of this study: {found}")
@@ -123,6 +127,7 @@ class Parts:
         path = self._folder / f"trial_{trial:06d}.parquet"
         try:
             self._require_alike(table)  # or a rerun would set it aside
+            _require_only(table, trial)
         except ResultsError as error:
             raise ResultsError(f"trial {trial} cannot be kept: {error}") from error
         _write([table], path, self._of)
@@ -173,6 +178,14 @@ class Parts:
                 waiting, trials = [], 0
         if waiting:
             yield pa.concat_tables(waiting)
+
+
+def _require_only(table: pa.Table, trial: int) -> None:
+    """Raise ResultsError where the rows are of another trial."""
+    found = table["trial"].unique().to_pylist()
+    if found != [trial]:
+        more = ", and others" if len(found) > 1 else ""
+        raise ResultsError(f"it holds trial {found[0]}{more}")
 
 
 def _unlike(schema: pa.Schema, like: pa.Schema) -> str:

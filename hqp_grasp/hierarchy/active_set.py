@@ -24,11 +24,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hqp_grasp.errors import InputError
 from hqp_grasp.hierarchy.certificate import EPS, ROUNDING
 from hqp_grasp.hierarchy.level import Stacked
+from hqp_grasp.kernels import njit
 
 CLEAR = 1e4  # a pivot this many times away from the rank tolerance needs no SVD
 JACOBI_SWEEPS = 12  # at most; it converges in six or seven

@@ -12,8 +12,9 @@ multipliers there are decide, found by non-negative least squares.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.optimize import nnls
+
+from hqp_grasp.kernels import njit
 
 EPS = float(np.finfo(float).eps)
 ROUNDING = 1e-13  # [–] of the terms that make up a sum: smaller is rounding

@@ -8,7 +8,10 @@ from typing import Protocol
 
 from numba.core import event
 
+from hqp_grasp import kernels
+
 LINE = "hqp_grasp: compiling the solver, once (up to a minute); the result is kept"
+ANEW = "hqp_grasp: compiling the solver (up to a minute)"  # it is not kept, and that has been said
 
 
 class Turn(Protocol):
@@ -29,7 +32,8 @@ class _Notice(event.Listener):
         function = event.data["dispatcher"].py_func
         if function.__module__.startswith("hqp_grasp.") and self.turn.acquire(False):
             # A progress bar may stand in this line: it is drawn anew below.
-            print(f"\r{LINE:80}", file=sys.stderr, flush=True)
+            line = ANEW if kernels.homeless else LINE
+            print(f"\r{line:80}", file=sys.stderr, flush=True)
 
     def on_end(self, event: event.Event) -> None:
         """Nothing to say."""

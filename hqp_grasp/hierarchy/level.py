@@ -8,10 +8,10 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from hqp_grasp.errors import InputError, SolverError, number
 from hqp_grasp.hierarchy.certificate import measure, optimality_faults
+from hqp_grasp.kernels import njit
 
 CERTIFICATE_TOLERANCE = 1e-8  # [–] row-scaled; what `is_optimal` asks unless told otherwise
 

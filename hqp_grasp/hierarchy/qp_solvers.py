@@ -21,11 +21,11 @@ import daqp
 import numpy as np
 import proxsuite
 import qpsolvers
-from numba import njit
 from scipy.sparse import csc_matrix
 
 from hqp_grasp.hierarchy.certificate import ROUNDING
 from hqp_grasp.hierarchy.level import Stacked
+from hqp_grasp.kernels import njit
 
 ACCURACY = 1e-6  # [–] asked of a solver; what it names is settled exactly afterwards
 AT_BOUND = 1e-5  # [–] scaled slack or dual above which a row holds x; well above ACCURACY

@@ -3,15 +3,20 @@
 import signal
 import subprocess
 import sys
+from functools import partial
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hqp_grasp.errors import ResultsError
 from hqp_grasp.experiments import parts as module
 from hqp_grasp.experiments.parts import Parts
 
+BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "damage.py"
 ROWS, SEED = 3, 7
 OF = bytes(range(32))  # what stands for the digest of a configuration
 
@@ -142,6 +147,202 @@ def test_a_broken_file_is_told_and_only_its_trials_are_missing(tmp_path, name, s
     assert merged(parts, tmp_path).equals(expected(range(10)))
     assert opened(tmp_path).broken == []
     assert path.with_suffix(".broken").read_bytes() == content
+
+
+def rewritten(change):
+    """A part written again by somebody else, its table changed."""
+    return lambda path: pq.write_table(change(pq.read_table(path)), path)
+
+
+def copied(name):
+    """Another file of the study in the place of a part."""
+    return lambda path: path.write_bytes((path.parent / name).read_bytes())
+
+
+def of_another_study(path):
+    module._write([table(9)], path, bytes(32))
+
+
+def of_another_seed(path):
+    rows = table(9)
+    module._write([rows.set_column(1, "seed", pa.array([SEED + 1] * ROWS))], path, OF)
+
+
+def written_so(change):
+    """A part sealed as ours, whatever it holds."""
+    return lambda path: module._write([change(table(9))], path, OF)
+
+
+def renamed(table):
+    return table.rename_columns(["trial", "seed", "probe", "worth", "error"])
+
+
+def retyped(table):
+    return table.set_column(3, "value", table["value"].cast(pa.string()))
+
+
+def permuted(table):
+    return table.select(["value", "trial", "seed", "probe", "error"])
+
+
+NAME_FLIPPED = b"error", b"urror"
+SPOILT = {  # how trial 9's file is spoilt, and the reason that is told
+    "a name in the footer": (
+        lambda path: path.write_bytes(path.read_bytes().replace(*NAME_FLIPPED)),
+        "checksum does not fit",
+    ),
+    "the seal": (
+        lambda path: path.write_bytes(
+            path.read_bytes().replace(b"hqp_grasp sha", b"hqp_grasp sya")
+        ),
+        "no seal",
+    ),
+    "by somebody else": (rewritten(lambda rows: rows), "no seal"),
+    "fewer rows by somebody else": (rewritten(lambda rows: rows[:1]), "no seal"),
+    "another trial": (copied("trial_000008.parquet"), "it holds trial 8"),
+    "a batch": (copied("batch_000001.parquet"), "it holds trial 4"),
+    "another study": (of_another_study, "another configuration"),
+    "another seed": (of_another_seed, f"not of seed {SEED}"),
+    "renamed": (written_so(renamed), "has no 'value'"),
+    "one more column": (
+        written_so(lambda rows: rows.append_column("more", rows["probe"])),
+        "has 'more'",
+    ),
+    "retyped": (written_so(retyped), "'value' is string, not double"),
+    "permuted": (written_so(permuted), "order is another"),
+    "fewer rows": (written_so(lambda rows: rows[:2]), f"trial 9 has 2 rows, not {ROWS}"),
+    "no rows": (written_so(lambda rows: rows[:0]), "no rows"),
+    "two trials": (
+        written_so(lambda rows: pa.concat_tables([rows, table(10)])),
+        "it holds trial 9, and others",
+    ),
+    "a folder": (lambda path: (path.unlink(), path.mkdir()), "Is a directory"),
+}
+
+
+@pytest.mark.parametrize("how", SPOILT)
+def test_a_part_that_does_not_fit_is_set_aside_by_name_with_the_reason(tmp_path, how):
+    added(tmp_path, range(10))
+    spoil, reason = SPOILT[how]
+    spoil(tmp_path / "trial_000009.parquet")
+    parts = opened(tmp_path)
+    (told,) = parts.broken
+    assert told.startswith("trial_000009.parquet (") and reason in told
+    assert [i for i in range(11) if not parts.is_done(i)] == [9, 10]
+    parts.add(9, table(9))
+    assert merged(parts, tmp_path).equals(expected(range(10)))
+    assert opened(tmp_path).broken == [] and (tmp_path / "trial_000009.broken").exists()
+
+
+def test_a_batch_in_the_place_of_another_is_no_other_and_its_trials_count_once(tmp_path):
+    added(tmp_path, range(8))
+    copied("batch_000000.parquet")(tmp_path / "batch_000001.parquet")
+    parts = opened(tmp_path)
+    assert [i for i in range(8) if parts.is_done(i)] == [0, 1, 2, 3]
+    for i in range(4, 8):
+        parts.add(i, table(i))
+    assert merged(parts, tmp_path).equals(expected(range(8)))
+
+
+@pytest.mark.parametrize(
+    "stray", ["batch_foo", "trial_foo", "trial_1", "trial_000001 (copy)", "batch_-00001"]
+)
+def test_a_stray_file_is_set_aside_by_name(tmp_path, stray):
+    added(tmp_path, range(5))
+    file = tmp_path / f"{stray}.parquet"
+    file.write_bytes((tmp_path / "trial_000004.parquet").read_bytes())
+    parts = opened(tmp_path)
+    assert parts.broken == [f"{stray}.parquet (no part has such a name)"]
+    assert merged(parts, tmp_path).equals(expected(range(5)))
+    assert (tmp_path / f"{stray}.broken").exists() and not file.exists()
+
+
+def test_files_of_other_kinds_are_left_alone(tmp_path):
+    added(tmp_path, range(2))
+    for name in ("notes.txt", "other.parquet"):
+        (tmp_path / name).write_text("mine")
+    assert opened(tmp_path).broken == []
+    assert {"notes.txt", "other.parquet"} < set(names(tmp_path))
+
+
+def test_a_part_that_may_not_be_read_stays_where_it_is(tmp_path, monkeypatch):
+    added(tmp_path, range(2))
+
+    def refuse(path, *args):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(ResultsError, match=r"trial_000000\.parquet cannot be read: Permission"):
+        opened(tmp_path)
+    assert names(tmp_path) == ["trial_000000.parquet", "trial_000001.parquet"]
+
+
+def test_rows_that_a_rerun_would_set_aside_are_not_kept(tmp_path):
+    parts = opened(tmp_path)
+    with pytest.raises(ResultsError, match=r"trial 3 cannot be kept: .* 'value' is string"):
+        parts.add(3, retyped(table(3)))
+    with pytest.raises(ResultsError, match="trial 3 cannot be kept: trial 3 has 2 rows, not 3"):
+        parts.add(3, table(3)[:2])
+    with pytest.raises(ResultsError, match="trial 3 cannot be kept: it holds trial 4"):
+        parts.add(3, table(4))
+    assert names(tmp_path) == []
+
+
+def test_a_batch_spoilt_while_the_study_runs_is_named_as_it_is_merged(tmp_path):
+    parts = added(tmp_path, range(8))
+    batch = tmp_path / "batch_000001.parquet"
+    batch.write_bytes(batch.read_bytes()[:-1])
+    with pytest.raises(ResultsError, match=r"batch_000001\.parquet was spoilt while .* again"):
+        merged(parts, tmp_path)
+
+
+def test_other_readers_see_nothing_of_a_seal(tmp_path):
+    added(tmp_path, [0])
+    part = tmp_path / "trial_000000.parquet"
+    assert pq.read_table(part).equals(table(0), check_metadata=True)
+    assert module.sealed(part) == OF
+
+
+# ---------------------------------------------------------------- all rows of a study
+
+
+NEEDED = {"trial": "whole numbers", "value": "numbers", "error": "texts"}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda rows: rows.drop_columns(["value"]), "no column 'value'"),
+        (lambda rows: rows.append_column("value", rows["value"]), "two columns 'value'"),
+        (lambda rows: rows[:0], "no rows"),
+        (retyped, "'value' holds string, not numbers"),
+        (lambda rows: rows.set_column(0, "trial", pa.array([1, None, 2])), "'trial' has gaps"),
+        (lambda rows: rows.set_column(0, "trial", pa.array([1.0, 1.0, 2.0])), "not whole numbers"),
+    ],
+)
+def test_rows_without_what_a_reader_needs_are_refused(tmp_path, change, reason):
+    pq.write_table(change(table(1)), tmp_path / "whole.parquet")
+    with pytest.raises(ResultsError, match=reason):
+        module.read_results(tmp_path / "whole.parquet", NEEDED)
+
+
+def test_a_reader_gets_what_it_needs_and_what_else_there_is_of_what_it_asks_for(tmp_path):
+    pq.write_table(table(1), tmp_path / "whole.parquet")
+    read = partial(module.read_results, tmp_path / "whole.parquet", NEEDED)
+    assert read({"probe": "whole numbers", "x": "texts"}).column_names == [*NEEDED, "probe"]
+    assert read(None).equals(table(1))
+
+
+def test_whatever_is_damaged_is_right_or_refused_in_words_and_made_good_by_a_rerun(monkeypatch):
+    """benchmarks/damage.py does so 2,000 times."""
+    spec = spec_from_file_location("damage", BENCHMARK)
+    damage = module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "damage", damage)  # dataclasses look their module up
+    spec.loader.exec_module(damage)
+    with damage.prepared() as sound:
+        found = [damage.fault(*sound, np.random.default_rng([1, i])) for i in range(30)]
+    assert {kind for kind, _ in found} >= {"trial", "batch", "probes.parquet", "history.json"}
+    assert [wrong for _, wrong in found if wrong] == []
 
 
 KILLED = """
