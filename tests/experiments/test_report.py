@@ -147,3 +147,24 @@ def test_a_folder_without_results_is_named(tmp_path, prepare, message):
     prepare(tmp_path / "a")
     with pytest.raises(ResultsError, match=message):
         outcomes(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: rows.drop_columns(["eps_f"]), "no column 'eps_f'"),
+        (lambda rows: rows.drop_columns(["adduction_deg"]), "no column 'adduction_deg'"),
+        (lambda rows: rows.drop_columns(rows.column_names[1:]), "no column 'seed'"),
+        (lambda rows: rows[:0], "no rows"),
+        (
+            lambda rows: rows.set_column(0, "trial", rows["trial"].cast(pa.string())),
+            "'trial' holds string, not whole numbers",
+        ),
+    ],
+)
+def test_a_folder_without_what_a_report_needs_says_what_is_missing(tmp_path, change, message):
+    folder = write(tmp_path / "a", TRIALS.values())
+    file = folder / "probes.parquet"
+    pq.write_table(change(pq.read_table(file)), file)
+    with pytest.raises(ResultsError, match=rf"a/probes\.parquet is broken \(.*{message}\); run"):
+        report([folder])

@@ -119,6 +119,21 @@ def test_a_folder_that_cannot_be_shown_says_what_is_missing(folders, tmp_path):
         Results.open(broken)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: rows.drop_columns(["eps_k"]), "no column 'eps_k'"),
+        (lambda rows: rows.drop_columns(["q_wam_j1"]), "no column 'q_wam_j1'"),
+        (lambda rows: rows[:0], "no rows"),
+    ],
+)
+def test_a_folder_without_what_is_shown_says_what_is_missing(folders, tmp_path, change, message):
+    copy = shutil.copytree(folders / "strict", tmp_path / "copy")
+    pq.write_table(change(pq.read_table(copy / "probes.parquet")), copy / "probes.parquet")
+    with pytest.raises(hg.ResultsError, match=f"copy cannot be read: it has {message}"):
+        Results.open(copy)
+
+
 def test_a_robot_that_changed_since_is_noticed(folders, tmp_path):
     shutil.copytree(folders / "strict", tmp_path / "old")
     config = json.loads((tmp_path / "old" / "config.json").read_text())
