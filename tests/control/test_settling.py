@@ -1,5 +1,7 @@
 """When the hand goes no further, by any laws and with any number of contacts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hqp_grasp.scenarios import cylinder
@@ -7,7 +9,7 @@ from own_law import HeightTask
 
 from hqp_grasp.control.forms import HierarchyForm
 from hqp_grasp.control.limits import StepLimit
-from hqp_grasp.control.settling import BETTER, FORCE_GOAL, PATIENCE, Course
+from hqp_grasp.control.settling import BETTER, FORCE_GOAL, HOPE, PATIENCE, SECURE, Course
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Stack, stack_of
@@ -136,3 +138,116 @@ def test_in_the_default_form_the_first_law_ends_met_and_above_force():
         record = trial.run((0, i))
         assert record.verdict == "good"
         assert record.column("error_height")[-1] < 1e-4
+
+
+# ---------------------------------------------------------------- held by friction
+
+
+def cone(k, lean, turn=0.0, noise=0.0, scale=1.0):
+    """k contacts around walls that lean by `lean` [rad]; all joints at `turn` [rad]."""
+    flat = ring(k, turn=turn)
+    n = np.cos(lean) * flat.normals - np.sin(lean) * np.array([0.0, 0.0, 1.0])
+    contacts = [
+        replace(contact, normal=normal, noise=noise)
+        for contact, normal in zip(flat.contacts, n, strict=True)
+    ]
+    return replace(flat, contacts=tuple(contacts), jacobian=scale * flat.jacobian)
+
+
+def leaning(k, *leans, **settings):
+    return [cone(k, lean, 0.1 * i, **settings) for i, lean in enumerate(leans)]
+
+
+@pytest.mark.parametrize("k", [2, 3, 5])
+@pytest.mark.parametrize("laws", ["fm", "fmk", "mfk"])
+def test_where_nothing_balances_a_secure_grasp_is_kept_once_no_better_one_comes(k, laws):
+    stack = stack_of(laws)
+    least = np.arctan(SECURE) - 0.05
+    worse = [least + 0.1 * np.random.default_rng(i).random() + 0.01 for i in range(HOPE)]
+    grasps = leaning(k, 0.5, least, *worse)
+    assert Course.of(stack, touched(*grasps[:-1])).way_back(None) is None
+    course = Course.of(stack, touched(*grasps))
+    assert course.best == -1 and course.nearest == 1
+    assert course.way_back(None) is not None
+    np.testing.assert_array_equal(course._way(None)[-1], grasps[1].q)
+    # A miss brings no better one either; a better one is gone on from.
+    assert Course.of(stack, touched(*grasps[:2], *[MISSED] * HOPE)).over
+    better = cone(k, least - 2.0 * BETTER, 5.0)
+    assert not Course.of(stack, touched(*grasps, better)).over
+
+
+def test_a_grasp_that_is_not_secure_is_kept_only_as_the_budget_ends():
+    stack = stack_of("fm").within(StepLimit())
+    lean = np.arctan(SECURE) + 0.01
+    grasps = leaning(3, 0.5, lean, *[0.6] * 3 * HOPE)
+    course = Course.of(stack, touched(*grasps))
+    assert course.nearest == 1 and course.way_back(None) is None
+    assert course.way_back(100) is None and course.way_back(len(course._way(None))) is not None
+
+
+def test_a_balanced_grasp_is_kept_before_one_that_friction_holds():
+    """Patience for balance is another: a grasp that balances is no matter of friction."""
+    grasps = [*leaning(3, *[0.1] * HOPE), *balanced(3, 1)]
+    course = Course.of(stack_of("fm"), touched(*grasps))
+    assert course.best == len(grasps) - 1 == course.nearest and not course.over
+
+
+def test_friction_is_no_matter_of_a_stack_that_balances_part_of_the_wrench():
+    """By the force alone the second is nearer to balance; friction has its moment to hold."""
+    one, two = cone(3, 0.15), ring(3, lean=0.05, rise=0.05, turn=0.1)
+    assert Course.of(stack_of("f"), touched(one, two)).nearest == 1
+    assert Course.of(stack_of("fm"), touched(one, two)).nearest == 0
+    assert not Course.of(stack_of("f"), touched(*leaning(3, *[0.15] * 2 * HOPE))).over
+
+
+def test_laws_above_are_not_given_up_for_a_grasp_that_friction_holds():
+    stack = HeightTask() >> ForceTask() >> MomentTask()
+    low, high = cone(3, 0.15), cone(3, 0.05, 0.1)
+    first = replace(high.contacts[0], position=high.contacts[0].position + np.array([0, 0, 5e-3]))
+    high = replace(high, contacts=(first, *high.contacts[1:]))
+    assert Course.of(stack, touched(low, high)).nearest == 0
+    assert Course.of(stack_of("fm"), touched(low, high)).nearest == 1
+
+
+def test_noise_of_normals_counts_as_friction_that_a_grasp_needs():
+    lean = np.arctan(SECURE) - 0.02
+    for noise, over in ((0.0, True), (0.005, True), (0.02, False)):
+        grasps = leaning(3, lean, *[0.5] * HOPE, noise=noise)
+        assert Course.of(stack_of("fm"), touched(*grasps)).over is over
+    sure, unsure = cone(3, 0.10, noise=1e-3), cone(3, 0.09, 0.1, noise=0.02)
+    assert Course.of(stack_of("fm"), touched(sure, unsure)).nearest == 0
+
+
+def test_a_secure_grasp_that_is_not_there_any_more_is_forgotten():
+    grasps = leaning(3, 0.1, *[0.5] * HOPE)
+    back = Touch(grasps[0].q, cone(3, 0.4))
+    course = Course.of(stack_of("fm"), [*touched(*grasps), back])
+    assert course.nearest == len(grasps) and not course.over
+
+
+def test_contacts_that_no_friction_balances_are_kept_by_the_laws():
+    """One contact, or all on one side: whatever is nearer to balance."""
+    one = [cone(1, lean, 0.1 * i) for i, lean in enumerate((0.3, 0.0))]
+    assert Course.of(stack_of("fm"), touched(*one)).way_back(None) is None
+    assert Course.of(stack_of("fm"), touched(*one)).nearest == 0  # none is nearer: |f| is 1 N
+
+
+def test_the_way_back_leads_over_grasps_felt_before():
+    """Straight on, fingers closed beside the object, again and again, until the hand gave up."""
+    stack = stack_of("fm").within(StepLimit(joint=0.25, contact=np.inf))
+    turns = [0.0, 0.2, 0.4, 0.6, 0.8]
+    grasps = [cone(3, 0.1 if turn == 0.0 else 0.5, turn) for turn in turns]
+    history = touched(*grasps, *[MISSED] * HOPE)
+    course = Course.of(stack, history)
+    assert [way[0] for way in course._way(None)] == [0.6, 0.4, 0.2, 0.0]
+    np.testing.assert_array_equal(course.way_back(None), grasps[3].q)
+    # Begun again elsewhere, it leads from there; where the hand is already, it stays.
+    np.testing.assert_array_equal(course.way_back(None, grasps[1]), grasps[0].q)
+    np.testing.assert_array_equal(course.way_back(None, grasps[0]), grasps[0].q)
+    # What was felt twice is passed once.
+    twice = touched(grasps[0], *[grasps[2]] * 2, cone(3, 0.5, 0.4), *[MISSED] * HOPE)
+    assert [way[0] for way in Course.of(stack, twice)._way(None)] == [0.0, 0.0]
+    # A step the hand took once it can take again, in as many touches as caps ask for.
+    far = Course.of(stack, touched(grasps[0], grasps[2], *[MISSED] * HOPE))
+    assert [way[0] for way in far._way(None)] == [0.0, 0.0]
+    assert far.way_back(4) is not None
