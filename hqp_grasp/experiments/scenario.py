@@ -183,7 +183,7 @@ def run(name: str, scene: Scene, settings: Settings) -> pa.Table:
     about = f"{name}: {Stack.of(trial.stack).name}, {settings.trials} trials"
     print(f"{about} of {settings.probes} probes")
     try:
-        table = study.run(out, COLUMNS)
+        table = study.run(out, (*COLUMNS, *trial.true_columns))
         ended = table.filter(pc.is_valid(table["error"]))
         failed = ended["trial"].unique().to_pylist()
         if len(failed) == settings.trials:
@@ -244,7 +244,8 @@ def replay_command(scene: Scene, settings: Settings, trial: int) -> str:
 def summary(table: pa.Table) -> str:
     """What came of the trials, for people."""
     texts = ("other_links", "in_transit", "method", "error", "unbalanced")
-    columns = {n: table[n].to_numpy() for n in COLUMNS if n not in texts}
+    there = [n for n in (*COLUMNS, *TRUE_COLUMNS) if n in table.column_names and n not in texts]
+    columns = {n: table[n].to_numpy() for n in there}
     trials = len(np.unique(columns["trial"]))
     shaped = {n: np.asarray(v).reshape(trials, -1) for n, v in columns.items()}
     touched = shaped["in_contact"].astype(bool)

@@ -89,6 +89,13 @@ class Trial:
             return self.probe
         return Physics() if self.probe == "physical" else None
 
+    @property
+    def true_columns(self) -> dict[str, object]:
+        """The columns of what is, beside what is felt; None in each."""
+        if self.physics is not None:
+            return true_columns()
+        return {} if self.noise is None else true_errors(None)
+
     def controller(self, scene: Scene) -> Controller:
         """The controller of one trial, in the scene where it began."""
         return Controller(scene.articulated, self.stack, self.form, self.probes + 1, self.landing)
@@ -216,10 +223,7 @@ class Trial:
     def _empty(
         self, robot: Robot, stack: Stack, solution: Solution | None = None
     ) -> dict[str, object]:
-        row = empty_row(robot, stack, solution)
-        if self.physics is not None:
-            return row | true_columns()
-        return row if self.noise is None else row | true_errors(None)
+        return empty_row(robot, stack, solution) | self.true_columns
 
     def _row(
         self,

@@ -300,6 +300,7 @@ def test_the_errors_of_the_probe_stand_beside_it(record, played):
     assert "cylinder, trial 0" in text and f"probe 3 of {PROBES}: touch" in text
     assert f"{record.rows[3]['eps_f']:.2e} N²" in text
     assert f"{1e3 * record.rows[3]['eps_m'] ** 0.5:.2e} mm·N" in text
+    assert f"holds if µ ≥ {record.rows[3]['friction_demand']:.2f}" in text
 
 
 def test_a_lost_grasp_turns_grey_and_the_reason_is_written(record, tmp_path):

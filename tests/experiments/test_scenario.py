@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
@@ -16,7 +17,7 @@ from hqp_grasp.control.controller import Controller
 from hqp_grasp.errors import ReachError, SolverError
 from hqp_grasp.experiments import start
 from hqp_grasp.experiments.plots import FLOOR, convergence, convergence_figure
-from hqp_grasp.experiments.scenario import Settings, replay_command, summary, trial_of
+from hqp_grasp.experiments.scenario import Settings, replay_command, run, summary, trial_of
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.world.scene import Prism, Scene
@@ -186,6 +187,27 @@ def with_a_lost_trial(table):
 
 def test_the_summarys_numbers_are_those_of_the_rows(ran):
     check(pq.read_table(ran[0] / "probes.parquet"))
+
+
+def test_secure_trials_and_why_others_do_not_balance_are_told(ran):
+    table = pq.read_table(ran[0] / "probes.parquet")
+    said = summary(table)
+    d = table.filter(pc.equal(table["probe"], PROBES))["friction_demand"].to_numpy()
+    assert f"secure{(d <= 0.2).sum():9} of {TRIALS} at the end" in said
+    assert f"the median holds if µ ≥ {np.median(d):.2f}" in said
+    at = table.column_names.index("unbalanced")
+    for why in (None, "walls lean"):
+        column = pa.array([why] * len(table), pa.string())
+        told = summary(table.set_column(at, "unbalanced", column))
+        assert (f"not balanced, most often ({TRIALS}): walls lean" in told) is (why is not None)
+
+
+@pytest.mark.parametrize("how", [{"noise": (0.02, 5e-4)}, {"probe": "physical"}])
+def test_the_table_on_screen_judges_by_what_is_where_that_is_known(how, tmp_path, capsys):
+    """It read what was felt: one trial under noise in three was good, and none was told."""
+    settings = Settings(trials=2, probes=2, jobs=1, out=tmp_path / "out", **how)
+    run("cylinder", Scene(), settings)
+    assert summary(pq.read_table(tmp_path / "out" / "probes.parquet")) in capsys.readouterr().out
 
 
 def test_a_lost_trial_is_counted_and_drawn(ran, tmp_path):

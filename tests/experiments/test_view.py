@@ -18,8 +18,8 @@ import hqp_grasp as hg
 from hqp_grasp.errors import MissingExtraError
 from hqp_grasp.experiments import scenario
 from hqp_grasp.experiments.fingerprint import Fingerprint
-from hqp_grasp.experiments.record import verdicts
-from hqp_grasp.experiments.view import Results, serve
+from hqp_grasp.experiments.record import secures, verdicts
+from hqp_grasp.experiments.view import Results, _numbers, serve
 
 pytest.importorskip("viser", reason="no viser: pip install 'hqp_grasp[view]'")
 
@@ -54,6 +54,24 @@ def test_a_folder_is_read_a_trial_at_a_time(folders):
         for kind in ("error", "lost", "not balanced", "link inside", "violation")
     }
     assert results.rows(3) == [row for row in rows if row["trial"] == 3]
+    assert results.secure == sum(secures(table).values())
+
+
+def test_a_probe_says_what_friction_holds_it(folders):
+    results = Results.open(folders / "strict")
+    row = results.rows(3)[5]
+    said = _numbers(3, 5, [(results, row), (results, row | {"friction_demand": np.inf})])
+    held = f"holds if µ ≥ {row['friction_demand']:.2f}"
+    assert f"| friction_demand |{held}|no friction holds it|" in said
+    older = {name: value for name, value in row.items() if name != "friction_demand"}
+    assert "holds" not in _numbers(3, 5, [(results, older)])
+
+
+def test_a_folder_from_before_friction_demands_opens(folders, tmp_path):
+    shutil.copytree(folders / "strict", tmp_path / "old")
+    path = tmp_path / "old" / "probes.parquet"
+    pq.write_table(pq.read_table(path).drop_columns(["friction_demand", "unbalanced"]), path)
+    assert Results.open(tmp_path / "old").secure is None
 
 
 @pytest.mark.parametrize(
