@@ -24,6 +24,8 @@ CONVERGED_FORCE = FORCE_GOAL  # [N²]
 CONVERGED_MOMENT = float(np.sqrt(MOMENT_GOAL))  # √ε_m [N·m]
 
 LEAN_STEPS = 20  # after which the direction that normals lean towards stands still
+PLACES = 6  # decimals of normals that tell two places apart
+ALIKE = np.radians(2.0)  # [rad] between the quartiles of leans that are of one wall
 LIKE = 2e-3  # [–] sines of leans that differ by less count as the same
 # Name, unit and meaning of the columns that every probe fills.
 COLUMNS = {
@@ -156,8 +158,10 @@ class Record:
         """Why no balanced grasp is felt at the end, in one line; None where one is."""
         if self.converged_at is not None or not self.grasps:
             return None  # balanced; or lost from the start
-        lean, most = _leans(np.concatenate([grasp.normals for grasp in self.grasps]))
-        if most > 0.0 and (self.grasps[-1].k * np.sin(most)) ** 2 > CONVERGED_FORCE:
+        n = np.concatenate([grasp.normals for grasp in self.grasps])
+        most, lean, least = _leans(np.unique(n.round(PLACES), axis=0))  # a grasp that is kept, once
+        alike = most - least <= ALIKE and least > 0.0
+        if alike and (self.grasps[-1].k * np.sin(least)) ** 2 > CONVERGED_FORCE:
             about = np.degrees(lean)
             return f"walls lean by about {about:.0f}°: equal forces cannot balance"
         if self.lost:
@@ -229,8 +233,8 @@ def balanced(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return (eps_f <= limits[0]) & (eps_m <= limits[1])  # NaN: not
 
 
-def _leans(normals: np.ndarray) -> tuple[float, float]:
-    """By what angle [rad] the normals (m, 3) lean: in the median, and three quarters of them.
+def _leans(normals: np.ndarray) -> np.ndarray:
+    """By what angles [rad] the normals (m, 3) lean: a quarter by more, a half, three quarters (3,).
 
     All towards one direction, that in which they differ least, as on a cone: those of an edge or
     an end, being far from the others, count the less for it.
@@ -243,7 +247,7 @@ def _leans(normals: np.ndarray) -> tuple[float, float]:
         middle = np.median(sines)
         weight = 1.0 / np.maximum(np.abs(sines - middle), LIKE)
     sines = np.clip(sines * np.copysign(1.0, middle), -1.0, 1.0)
-    return float(np.arcsin(np.median(sines))), float(np.arcsin(np.quantile(sines, 0.25)))
+    return np.arcsin(np.quantile(sines, [0.75, 0.5, 0.25]))
 
 
 def meaning(column: str) -> str:
