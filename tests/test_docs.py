@@ -43,6 +43,7 @@ PYTHON_ON = [
 ]
 COMMANDS_ON = [
     "any-robot.md",
+    "judging.md",
     "looking.md",
     "many-trials.md",
     "objects.md",
@@ -81,6 +82,8 @@ def call(arguments, monkeypatch):
         arguments = [*arguments, *SMALL, "--trials", trials]
     elif arguments[0] == "view":
         arguments = [*arguments, "--port", "0"]
+    elif arguments[0] == "judge":
+        arguments = [*arguments, "--jobs", "1"]
     monkeypatch.setattr(sys, "argv", [module, *arguments])
     started = ("hqp_grasp.__main__", "hqp_grasp.scenarios.")
     for name in [name for name in sys.modules if name.startswith(started)]:
