@@ -280,7 +280,7 @@ def test_a_failing_trial_is_recorded_and_the_others_go_on(done, study, tmp_path,
         else:
             assert row["in_contact"] is False
             told = {name for name, value in row.items() if value not in (None, False, 0.0, "")}
-            assert told <= {"trial", "seed", "cpu", "probe", "rejected", "error"}
+            assert told <= {"trial", "seed", "cpu", "probe", "rejected", "error", "unbalanced"}
 
 
 def test_a_rerun_tries_failed_trials_again_and_no_others(done, study, tmp_path, failing, ran):
