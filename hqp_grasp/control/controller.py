@@ -197,14 +197,8 @@ class Controller:
             raise InputError("the history is empty: it begins with the first touch")
         grasps: list[Grasp] = []
         stand = _Stand()
+        self._require_own(history)
         for touch in history:
-            if not isinstance(touch, Touch):
-                raise InputError(f"a history holds Touch values; got {touch!r}")
-            if len(touch.q_target) != self.robot.n:
-                raise InputError(
-                    f"a touch has {len(touch.q_target)} joints, {self.robot} has {self.robot.n}: "
-                    "is it of another robot?"
-                )
             since = None if stand.since is None else stand.since + 1
             if isinstance(touch.felt, Grasp):
                 grasps.append(touch.felt)
@@ -218,6 +212,35 @@ class Controller:
             else:
                 stand = _Stand(stand.grasp, misses, since, stand.lost)
         return stand
+
+    def _require_own(self, history: Sequence[Touch]) -> None:
+        """Raise InputError unless the touches are of this robot, and of one hand."""
+        first: Grasp | None = None
+        postures: list[np.ndarray] = []
+        for touch in history:
+            if not isinstance(touch, Touch):
+                raise InputError(f"a history holds Touch values; got {touch!r}")
+            if len(touch.q_target) != self.robot.n:
+                raise InputError(
+                    f"a touch has {len(touch.q_target)} joints, {self.robot} has {self.robot.n}: "
+                    "is it of another robot?"
+                )
+            postures.append(touch.q_target)
+            if isinstance(touch.felt, Grasp):
+                postures.append(touch.felt.q)
+                first = first or touch.felt
+                if touch.felt.k != first.k:
+                    raise InputError(
+                        f"a touch felt {touch.felt.k} contacts, the first {first.k}: "
+                        "is it of another hand?"
+                    )
+        q, lower, upper = np.array(postures), self.robot.q_lower, self.robot.q_upper
+        # A hand may begin outside a range, but not by more than all of it.
+        for at, i in np.argwhere(np.maximum(lower - q, q - upper) > upper - lower):
+            raise InputError(
+                f"a touch has {self.robot.joints[i]} at {q[at, i]:g}, and its range is "
+                f"{lower[i]:g} … {upper[i]:g}: is it of another robot, or in degrees?"
+            )
 
     def _clipped(self, grasp: Grasp, x: np.ndarray) -> np.ndarray:
         """q + x within the ranges, as the very last act: only rounding may be cut."""

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import itertools
 import json
+import re
 
 import numpy as np
 import pytest
@@ -112,6 +113,61 @@ def test_a_history_stored_with_a_field_that_contacts_no_longer_have_is_read(firs
     older[0]["felt"]["contacts"][0]["colour"] = "red"
     path.write_text(json.dumps(older))
     with pytest.raises(ResultsError, match=r"no history of touches.*colour"):
+        load_history(path)
+
+
+def test_a_history_whose_grasps_differ_in_contacts_is_refused(robot, stack, first, tmp_path):
+    two = Grasp(first.q, first.contacts[:2], first.jacobian[:6])
+    controller = Controller(robot, stack)
+    for grasps in ((first, two), (two, first)):
+        history = [Touch(first.q, grasp) for grasp in grasps]
+        with pytest.raises(InputError, match=r"felt \d contacts, the first \d: is it of another"):
+            controller.step(history)
+        with pytest.raises(InputError, match=r"touch 1 felt \d contacts .*: a history is of one"):
+            save_history(tmp_path / "h.json", history)
+    save_history(tmp_path / "h.json", [Touch(first.q, first)])
+    touches = json.loads((tmp_path / "h.json").read_text())["touches"]
+    touches.append(json.loads(json.dumps(touches[0])))
+    touches[1]["felt"]["contacts"][2]["name"] = "thumb"
+    (tmp_path / "h.json").write_text(json.dumps(touches))
+    with pytest.raises(ResultsError, match=r"no history of touches.*thumb"):
+        load_history(tmp_path / "h.json")
+
+
+def test_a_history_far_outside_the_ranges_is_refused_and_one_a_little_outside_is_not(
+    robot, stack, first
+):
+    controller, width = Controller(robot, stack), robot.q_upper - robot.q_lower
+    for share, sign in itertools.product((0.05, 1.1), (-1, 1)):
+        q = np.array(first.q)
+        end = robot.q_lower if sign < 0 else robot.q_upper
+        q[-1] = end[-1] + sign * share * width[-1]
+        felt = dataclasses.replace(first, q=q)
+        for touch in (Touch(q, first), Touch(first.q, felt), Touch(q, Missed(Miss.STUCK, "a"))):
+            if share > 1.0:
+                with pytest.raises(InputError, match=f"{robot.joints[-1]} at .* its range is"):
+                    controller.step([Touch(first.q, first), touch])
+            else:
+                controller.step([Touch(first.q, first), touch])
+
+
+@pytest.mark.parametrize("spoil", ["digit", "key", "null", "cut", "deep", "huge"])
+def test_a_damaged_history_is_told(first, tmp_path, spoil):
+    path = tmp_path / "h.json"
+    save_history(path, [Touch(first.q, first)])
+    text = path.read_text()
+    number = repr(float(first.q[0]))
+    path.write_text(
+        {
+            "digit": text.replace(number, number[:-1] + str((int(number[-1]) + 1) % 10)),
+            "key": text.replace("sha256", "sha257"),
+            "null": re.sub('"[0-9a-f]{64}"', "null", text),
+            "cut": text[:-1],
+            "deep": "[" * 100_000,
+            "huge": text.replace(number, "1" + "0" * 400),
+        }[spoil]
+    )
+    with pytest.raises(ResultsError, match=r"h\.json is (damaged|no history of touches)"):
         load_history(path)
 
 
