@@ -144,6 +144,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,polygons,benchmarks/polygons.py --polygons 20 --starts 50 --seed 0)
 	$(call keep,caps,benchmarks/caps.py --trials 200 --seed 90)
 	$(call keep,probing,benchmarks/probing.py)
+	$(call keep,damage,benchmarks/damage.py --damages 2000 --seed 20)
 	$(call keep,probing-joints,benchmarks/probing.py --robots bhand wam_bhand umass_torso --joints 8 16 24 32 40)
 	$(call keep,short-of-joints,benchmarks/short_of_joints.py --configurations 2000 --seed 0)
 	$(call keep,tips,benchmarks/tips.py --trials 20 --seed 906)

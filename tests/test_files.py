@@ -132,7 +132,9 @@ def test_what_dead_processes_left_is_swept_and_what_is_being_written_stays(tmp_p
 
 def test_a_study_sweeps_its_folder(tmp_path):
     (tmp_path / "parts").mkdir()
-    left = [tmp_path / "config.json.4194305.part", tmp_path / "parts/trial_000000.4194305.part"]
+    dead, alive = 4194305, os.getpid()  # a number that another process may have got since
+    names = ("config.json", "probes.parquet", "parts/trial_000000.parquet")
+    left = [tmp_path / f"{name}.{number}.part" for name in names for number in (dead, alive)]
     for path in left:
         path.write_text("half")
     hg.Study(TRIAL, trials=1).run(tmp_path)

@@ -439,6 +439,17 @@ def test_only_the_columns_asked_for_are_returned(done, study, folder):
 # ---------------------------------------------------------------- refusals
 
 
+def test_of_two_runs_that_begin_at_once_in_a_fresh_folder_one_is_refused(study, tmp_path, ran):
+    other = dataclasses.replace(study, seed=SEED + 1)
+    with module._claimed(tmp_path, study.configuration()):
+        before = (tmp_path / "config.json").read_bytes()
+        (tmp_path / "config.json").unlink()  # as if the other had not yet written it
+        with pytest.raises(ResultsError, match="is being written by another run"):
+            other.run(tmp_path)
+        (tmp_path / "config.json").write_bytes(before)
+    assert ran == []
+
+
 def test_a_folder_that_another_run_writes_is_refused(study, folder, ran):
     with (
         module._claimed(folder, study.configuration()),
