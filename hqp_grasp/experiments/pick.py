@@ -24,7 +24,7 @@ from hqp_grasp.world.scene import Scene
 HELD = ("loosen", "lift", "hold", "shake")  # phases in which the object should not slip
 AFTER = 0.5  # [s] after which a released object stands, or does not
 BACK = 1e-3  # [rad] of a posture where it was before, within which the hand is there again
-SHARE = 0.6  # of the driver's grip limit that a grip may ask of one contact: the rest is for bumps
+SHARE = 0.75  # of the driver's grip limit that a grip may ask of one contact: the rest is for bumps
 RISEN = 0.9  # share of the palm's way that a lifted object has risen by, at least
 STANDS = 0.01  # [m] from where it stood, within which an object was set down there
 UPRIGHT = np.radians(15.0)
