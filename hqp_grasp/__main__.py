@@ -12,6 +12,7 @@ from tyro.extras import SubcommandApp
 
 import hqp_grasp.scenarios
 from hqp_grasp.errors import HqpGraspError, one_of
+from hqp_grasp.experiments import picking
 from hqp_grasp.experiments import report as reports
 from hqp_grasp.experiments.judging import Judging, judge_folder, summary
 from hqp_grasp.experiments.plain import speak_plainly
@@ -30,10 +31,25 @@ def run(scenario: Positional[str], /) -> None:
     Args:
         scenario: cylinder, cylinder_65, hexagon, irregular, prism or object.
     """
+    runpy.run_module(f"hqp_grasp.scenarios.{_scenario(scenario)}", run_name="__main__")
+
+
+@app.command
+def pick(scenario: Positional[str], /) -> None:
+    """Find an object by touch, hold, lift, shake and set it down: `pick cylinder --help`.
+
+    Takes the scenario's own arguments, and the object's mass, the strength of the grip, the
+    friction believed in. Writes DIR/picks.parquet, one row a trial.
+
+    Args:
+        scenario: cylinder, cylinder_65, hexagon, irregular, prism or object.
+    """
+    picking.main(_scenario(scenario))
+
+
+def _scenario(name: str) -> str:
     names = sorted(module.name for module in pkgutil.iter_modules(hqp_grasp.scenarios.__path__))
-    runpy.run_module(
-        f"hqp_grasp.scenarios.{one_of('scenario', scenario, names)}", run_name="__main__"
-    )
+    return one_of("scenario", name, names)
 
 
 @app.command
@@ -127,10 +143,11 @@ def main() -> None:
     """Run the command that the arguments name; what is wrong is said in one line."""
     speak_plainly()
     try:
-        if sys.argv[1:2] == ["run"] and len(sys.argv) > 2 and not sys.argv[2].startswith("-"):
+        command = {"run": run, "pick": pick}.get("".join(sys.argv[1:2]))
+        if command and len(sys.argv) > 2 and not sys.argv[2].startswith("-"):
             name = sys.argv[2]
             sys.argv[1:3] = []  # the scenario reads the rest
-            run(name)
+            command(name)
         else:
             app.cli(prog="python -m hqp_grasp")
     except HqpGraspError as error:

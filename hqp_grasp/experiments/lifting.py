@@ -51,14 +51,6 @@ class Lift:
     reason: str = ""  # what went wrong, or why it was set down early
 
 
-class _LostError(Exception):
-    """The object is not held any more, or should be set down: why, and whether it is gone."""
-
-    def __init__(self, reason: str, gone: bool) -> None:
-        super().__init__(reason)
-        self.reason, self.gone = reason, gone
-
-
 def lift(
     probe: PhysicalProbe,
     hold: Hold,

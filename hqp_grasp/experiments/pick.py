@@ -64,7 +64,8 @@ class Picked:
     seed: tuple[int, ...]
     row: Mapping[str, object]  # the COLUMNS
     looks: tuple[Mapping[str, object], ...] = ()  # the LOOKs
-    touches: tuple[Touch, ...] = ()  # that found the grasp
+    touches: tuple[Touch, ...] = ()  # that found the grasp,
+    told: tuple[Mapping[str, object], ...] = ()  # and their rows, as in a record
 
     def __repr__(self) -> str:
         if self.row["error"]:
@@ -141,18 +142,19 @@ class Pick:
         began = self.trial.begin(entropy)
         hand, probe = began.hand, began.touching
         assert hand is not None and isinstance(probe, PhysicalProbe)
-        history = self._find(began)
+        history, told = self._find(began)
         row: dict[str, object] = dict.fromkeys(COLUMNS)
         row |= {"lifted": False, "set_down": False, "touches": len(history)}
         last = history[-1].felt
         if not isinstance(last, Grasp):
             row["reason"] = f"no grasp to lift: {last.reason.value} ({last.where})"
-            return Picked(entropy, row, (), history)
+            return Picked(entropy, row, (), history, told)
         log = _Log(hand)
         hold = self._hold(began.first.scene, hand.limits.grip)
         done = lift(probe, hold, last, self.height, log.look)
         hand.wait(AFTER)
-        return Picked(entropy, row | log.row(done, self.height), tuple(log.looks), history)
+        row |= log.row(done, self.height)
+        return Picked(entropy, row, tuple(log.looks), history, told)
 
     def attempt(self, seed: Sequence[int]) -> Picked:
         """`run`, but what it raises becomes the row's error."""
@@ -171,19 +173,21 @@ class Pick:
         most = min(Grip.most, SHARE * grip)
         return Hold(Grip(scene.articulated, min(self.force, most), self.friction, most))
 
-    def _find(self, began: Began) -> tuple[Touch, ...]:
-        """Touch until the hand has settled, gives up, or has made all its touches."""
+    def _find(self, began: Began) -> tuple[tuple[Touch, ...], tuple[Mapping[str, object], ...]]:
+        """Touch until the hand has settled, gives up, or has made all its touches; their rows."""
         history: list[Touch] = []
-        for told, touch in self.trial.touches(began):
+        rows: list[Mapping[str, object]] = []
+        for row, touch in self.trial.touches(began):
             if touch is None:
                 break
             history.append(touch)
-            settled = str(told.get("planner") or "").startswith("return")
+            rows.append(row)
+            settled = str(row.get("planner") or "").startswith("return")
             if settled and isinstance(touch.felt, Grasp):
                 before = (t.felt for t in history[:-1] if isinstance(t.felt, Grasp))
                 if any(np.abs(touch.q_target - grasp.q).max() < BACK for grasp in before):
                     break
-        return tuple(history)
+        return tuple(history), tuple(rows)
 
 
 class _Log:

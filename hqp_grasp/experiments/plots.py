@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -10,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from hqp_grasp.errors import ResultsError
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 from hqp_grasp.files import whole_file
 
@@ -69,3 +72,39 @@ def _spread(axes: Axes, values: np.ndarray, color: str, label: str) -> None:
         probes[some], np.nanmin(shown, axis=0), np.nanmax(shown, axis=0), color=color, alpha=0.2
     )
     axes.plot(probes[some], np.nanmedian(shown, axis=0), color=color, label=label)
+
+
+def picked(looks: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """Draw `picked_figure` into the file `path`. Raises ResultsError where nothing was lifted."""
+    if not looks:
+        raise ResultsError("nothing was held, so there is nothing to draw")
+    with whole_file(path) as part:
+        picked_figure(looks, title).savefig(part, dpi=130, format="png")
+
+
+def picked_figure(looks: Sequence[Mapping[str, Any]], title: str) -> Figure:
+    """The contacts' normal forces and the load over time, the phases of a pick in the background.
+
+    `looks` are rows with the fields of `experiments.pick.LOOK`.
+    """
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    time = np.array([look["time"] for look in looks]) - looks[0]["time"]
+    k = max(len(look["normal"]) for look in looks)
+    normal = np.array([look["normal"] or [np.nan] * k for look in looks]).reshape(len(looks), k)
+    for i in range(k):
+        axes.plot(time, normal[:, i], lw=1, label=f"normal force, contact {i + 1}")
+    axes.plot(time, [look["strength"] for look in looks], "k:", label="asked for in the mean")
+    axes.plot(time, [look["load"] for look in looks], color=MOMENT, lw=2, label="load")
+    phases = [look["phase"] for look in looks]
+    begins = [i for i in range(len(looks)) if i == 0 or phases[i] != phases[i - 1]]
+    ends = [*(time[i] for i in begins[1:]), time[-1]]
+    for n, (i, end) in enumerate(zip(begins, ends, strict=True)):
+        axes.axvspan(time[i], end, color="0.5", alpha=0.08 if n % 2 else 0.2, lw=0)
+        at = (0.5 * (time[i] + end), 1.01)
+        axes.text(*at, phases[i], transform=axes.get_xaxis_transform(), ha="center", fontsize=8)
+    axes.set(xlabel="time [s]", ylabel="force [N]")
+    axes.legend(fontsize=8)
+    figure.suptitle(title)
+    return figure

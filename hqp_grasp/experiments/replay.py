@@ -29,6 +29,7 @@ from hqp_grasp.experiments.record import (
     holds,
 )
 from hqp_grasp.files import whole_file
+from hqp_grasp.grasp import Grasp, Touch
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
@@ -38,6 +39,7 @@ ERRORS = ("eps_f", "eps_m", "eps_k", "friction_demand")  # in N², (N·m)², rad
 PLACED = 1e-5  # [m] tips fit their contacts to this, or the hand is elsewhere
 SECONDS_A_PROBE = 1.0  # the time bar counts seconds, so it counts probes
 ARROW = 0.04  # [m] a unit vector, a force of 1 N
+CARRY_ARROW = 0.006  # [m/N] while the object is held
 NORMAL_COLOUR, FORCE_COLOUR, NET_COLOUR = (204, 61, 163), (0, 60, 230), (200, 20, 20)
 FELT_COLOUR = (30, 30, 30)
 GHOST_COLOUR = (70, 130, 230)
@@ -62,6 +64,41 @@ class Frame:
     errors: Mapping[str, float]  # ERRORS of this probe, NaN where it did not touch
     outcome: str
     touched: bool
+    held: Held | None = None  # of a look at what the hand holds, which is no probe
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What the hand holds, as it is drawn."""
+
+    forces: np.ndarray  # (k, 3) [N] of the contacts on the object, world
+    place: np.ndarray  # (7,) the object's [m] and quaternion, world
+    duration: float  # [s] until the next look
+    lines: tuple[str, ...]  # about it
+
+
+def frames_of_pick(
+    rows: Sequence[Mapping[str, Any]], touches: Sequence[Touch], looks: Sequence[Mapping[str, Any]]
+) -> list[Frame]:
+    """The probes of a pick, then the looks at what the hand holds: the fields of `pick.LOOK`."""
+    felt = [touch.felt if isinstance(touch.felt, Grasp) else None for touch in touches]
+    drawn = [None if g is None else (g.q, g.positions, g.normals) for g in felt]
+    frames = _frames(rows, drawn)
+    ends = [look["time"] for look in looks[1:]]
+    for look, end in zip(looks, [*ends, *(look["time"] for look in looks[-1:])], strict=True):
+        contacts = np.reshape(look["contacts"], (-1, 9))
+        lines = (
+            f"{look['phase']}: {look['load']:.2f} N carried",
+            f"asked for {look['strength']:.1f} N a contact, in the mean",
+            "felt " + (", ".join(f"{a:.1f}" for a in look["normal"]) + " N" * bool(len(contacts))),
+            f"forces drawn {1e3 * CARRY_ARROW:g} mm a newton",
+        )
+        held = Held(contacts[:, 6:], np.array(look["object"]), end - look["time"], lines)
+        last = frames[-1]
+        q = np.array(look["q"]) if len(look["q"]) else last.q
+        at = contacts[:, :3], contacts[:, 3:6]
+        frames.append(Frame(q, *at, dict.fromkeys(ERRORS, np.nan), look["phase"], True, held))
+    return frames
 
 
 def frames_of(record: Record) -> list[Frame]:
@@ -225,7 +262,7 @@ class Drawing:
         self, scene_api: Any, scene: Scene, name: str = "/hand", ghost: bool = False
     ) -> None:
         self._root = scene_api.add_frame(name, show_axes=False)
-        thing = scene.model.body(OBJECT).id
+        self._thing = thing = scene.model.body(OBJECT).id
         self._bodies = {
             body: scene_api.add_frame(f"{name}/body_{body}", show_axes=False)
             for body in range(scene.model.nbody)
@@ -271,11 +308,17 @@ class Drawing:
         """Draw a probe of the robot, `placed` for this trial, and all that was felt up to it."""
         frame = frames[probe]
         position, wxyz = robot.bodies(frame.q)
+        if frame.held is not None:
+            position, wxyz = position.copy(), wxyz.copy()
+            position[self._thing], wxyz[self._thing] = frame.held.place[:3], frame.held.place[3:]
         for body, handle in self._bodies.items():
             handle.position, handle.wxyz = position[body], wxyz[body]
         if not self._arrows:
             return
         at, n = frame.positions, frame.normals
+        if frame.held is not None:
+            self._show_held(at, frame.held.forces)
+            return
         centroid = at.mean(axis=0, keepdims=True) if len(at) else at
         net = -n.sum(axis=0, keepdims=True)
         if np.linalg.norm(net) * ARROW < ARROWS["net_force"]["head_length"]:
@@ -285,6 +328,16 @@ class Drawing:
         self._arrow("net_force", centroid, net, frame.touched, NET_COLOUR)
         felt = [f.positions for f in frames[: probe + 1] if f.touched]
         _put(self._felt, "points", np.concatenate([np.zeros((0, 3)), *felt]).astype(np.float32))
+
+    def _show_held(self, at: np.ndarray, forces: np.ndarray) -> None:
+        """Draw the forces on what is held, and their sum; touches are not of its place any more."""
+        none, scale = np.zeros((0, 3)), CARRY_ARROW / ARROW
+        middle = at.mean(axis=0, keepdims=True) if len(at) else none
+        self._arrow("normals", none, none, True, NORMAL_COLOUR)
+        self._arrow("forces", at - scale * ARROW * forces, scale * forces, True, FORCE_COLOUR)
+        net = scale * forces.sum(axis=0, keepdims=True) if len(at) else none
+        self._arrow("net_force", middle, net, True, NET_COLOUR)
+        _put(self._felt, "points", none.astype(np.float32))
 
     def _arrow(
         self, kind: str, start: np.ndarray, vector: np.ndarray, touched: bool, colour: Colour
@@ -327,7 +380,8 @@ def write_replay(
         for probe in range(len(frames)):
             drawing.show(robot, frames, probe)
             panel.show(probe)
-            recording.insert_sleep(SECONDS_A_PROBE)
+            held = frames[probe].held
+            recording.insert_sleep(SECONDS_A_PROBE if held is None else held.duration)
         page = recording.as_html()
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
     with whole_file(path) as part:
@@ -400,7 +454,7 @@ class _Panel:
 
     def __init__(self, scene_api: Any, frames: Sequence[Frame], camera: Camera, title: str) -> None:
         self._frames, self._title = frames, title
-        figure = errors_figure(frames)
+        figure = errors_figure([frame for frame in frames if frame.held is None])
         canvas = FigureCanvasAgg(figure)  # a canvas of its own: no display is needed
         canvas.draw()
         image = np.asarray(canvas.buffer_rgba())[..., :3]
@@ -437,6 +491,7 @@ class _Panel:
         points = []
         for axes, box in self._axes:
             low, high = axes.get_xlim()
+            probe = min(probe, int(high))  # what is held has no errors: the line stays at the last
             x = box.x0 + box.width * (probe - low) / (high - low)
             points.append([self._on_plane(x, box.y0), self._on_plane(x, box.y1)])
         return np.array(points, dtype=np.float32)
@@ -448,7 +503,10 @@ class _Panel:
 def describe(frames: Sequence[Frame], probe: int) -> list[str]:
     """A probe in a few lines: its number, its errors with units, how it ended."""
     frame = frames[probe]
-    lines = [f"probe {probe} of {len(frames) - 1}: {frame.outcome}"]
+    if frame.held is not None:
+        return list(frame.held.lines)
+    probes = sum(frame.held is None for frame in frames)
+    lines = [f"probe {probe} of {probes - 1}: {frame.outcome}"]
     if frame.touched:
         e = frame.errors
         lines += [

@@ -225,15 +225,20 @@ def _replay(scene: Scene, trial: int, out: Path, name: str) -> None:
         print(f"replay   none: {error}")
 
 
-def replay_command(scene: Scene, settings: Settings, trial: int) -> str:
-    """A line for the shell that runs one trial alone, and shows the whole error."""
+def replay_command(
+    scene: Scene, settings: Settings, trial: int, made: str = "trial_of", by: str = "scenario"
+) -> str:
+    """A line for the shell that runs one trial alone, and shows the whole error.
+
+    `made` is the function that makes the trial of scene and settings, `by` the module it is in.
+    """
     decisive = [f for f in fields(settings) if f.name not in ABOUT_THE_RUN]
     chosen = {f.name: getattr(settings, f.name) for f in decisive}
     changed = [f"{f.name}={chosen[f.name]!r}" for f in decisive if chosen[f.name] != f.default]
     code = (
         "from pathlib import *; from hqp_grasp import *; "
-        "from hqp_grasp.experiments.scenario import *; "
-        f"trial = trial_of({scene!r}, Settings({', '.join(changed)})); "
+        f"from hqp_grasp.experiments.{by} import *; "
+        f"trial = {made}({scene!r}, {type(settings).__name__}({', '.join(changed)})); "
         f"print(trial.run(({settings.seed}, {trial})))"
     )
     if '"' not in code:
