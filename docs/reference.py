@@ -17,6 +17,7 @@ PARTS = {
     "control": "Control",
     "world": "World",
     "touch": "Touch",
+    "judge": "Judge",
     "experiments": "Experiments",
     "errors": "Errors",
 }

@@ -3,6 +3,7 @@
 from hqp_grasp.control.controller import Controller, Step
 from hqp_grasp.control.forces import GRIP_LAWS, Felt, ForceLaw, Forces, Grip, Squeeze
 from hqp_grasp.control.forms import ClippedForm, HierarchyForm, MemorylessForm, PaperForm
+from hqp_grasp.control.hold import Hold, Press
 from hqp_grasp.control.ik import ik_levels, solve_ik
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit, VelocityLimit
 from hqp_grasp.errors import (
@@ -15,6 +16,8 @@ from hqp_grasp.errors import (
     SolverError,
     TrialError,
 )
+from hqp_grasp.experiments.lifting import Lift, lift
+from hqp_grasp.experiments.pick import Pick, Picked
 from hqp_grasp.experiments.record import Record
 from hqp_grasp.experiments.start import Start
 from hqp_grasp.experiments.study import Study
@@ -24,6 +27,7 @@ from hqp_grasp.hierarchy.hqp import HQP, solvers
 from hqp_grasp.hierarchy.level import Level, LevelReport, Solution
 from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.history import load_history, save_history
+from hqp_grasp.judge.judge import Judge, Judged
 from hqp_grasp.tasks import (
     ContactSpaceTask,
     ContactTask,
@@ -73,12 +77,16 @@ __all__ = [
     "Grasp",
     "Grip",
     "HierarchyForm",
+    "Hold",
     "HqpGraspError",
     "Imperfections",
     "InputError",
+    "Judge",
+    "Judged",
     "KinematicTask",
     "Level",
     "LevelReport",
+    "Lift",
     "Limit",
     "MemorylessForm",
     "MinkLimit",
@@ -90,7 +98,10 @@ __all__ = [
     "PaperForm",
     "PhysicalProbe",
     "Physics",
+    "Pick",
+    "Picked",
     "PostureTask",
+    "Press",
     "Priority",
     "Prism",
     "Probe",
@@ -118,6 +129,7 @@ __all__ = [
     "TrialError",
     "VelocityLimit",
     "ik_levels",
+    "lift",
     "load_history",
     "save_history",
     "sense",

@@ -10,9 +10,9 @@ from hqp_grasp.control.forces import Grip, Squeeze
 from hqp_grasp.errors import InputError, instance, whole
 from hqp_grasp.grasp import Grasp, Miss, Missed
 
-RESERVE = 0.5  # share of the friction believed in that the load uses of all contacts together,
-ALARM = 0.8  # or any one contact, before the grip grows
-GROWTH, RELAXING = 1.25, 0.97  # by which the grip grows, or becomes weaker, at a step, at most
+RESERVE = 0.5  # share of the friction believed in that the load may use of all contacts together
+RELAXING = 0.97  # by which the grip becomes weaker at a step, at most
+FOLLOWED = 0.9  # share of the forces asked for that a hand which follows is felt to press with
 ROUNDING = 1e-3  # [N] that normal forces may fall short of what is asked by
 
 
@@ -25,7 +25,7 @@ class Press:
     squeeze: Squeeze  # the forces behind it, as last computed
     used: float = 0.0  # friction |t|/a that the contact nearest to slipping was felt to use
     load: float = 0.0  # [N] the contacts' net force on the object, upwards
-    blind: int = 0  # steps in a row that felt no grasp,
+    blind: int = 0  # steps in a row that felt no grasp, or found no forces,
     straining: int = 0  # or contacts near slipping that could not be pressed harder
     reason: str = ""  # why the object should be set down; empty while it is safe
 
@@ -34,12 +34,12 @@ class Press:
 class Hold:
     """Presses as its grip says, harder where contacts come near to slipping.
 
-    `step` is a pure function of what is felt and of the step before. The grip grows until the load
-    uses no more than RESERVE of the friction believed in, and no contact more than ALARM of it; it
-    relaxes slowly where less is used, never below `grip.force`. Where nothing is felt the last
-    torques are kept. The object should be set down, and `Press.reason` says so, where for
-    `patience` steps nothing was felt, or contacts beyond the friction believed in could not be
-    pressed harder.
+    `step` is a pure function of what is felt and of the step before. The grip is as strong as it
+    must be for the load to use no more than RESERVE of the friction believed in, and no contact
+    more than all of it; it relaxes slowly, never below `grip.force`. Where nothing is felt, or no
+    forces are found, the last torques are kept. The object should be set down, and `Press.reason`
+    says so, where that lasts for `patience` steps, or where contacts beyond the friction believed
+    in cannot be pressed harder.
     """
 
     grip: Grip
@@ -57,30 +57,40 @@ class Hold:
         """
         if isinstance(felt, Missed):
             return self._blind(felt, last)
-        used, shared, load = _friction_used(felt)
-        strength = self.grip.force if last is None else last.strength
-        growth = max(shared / RESERVE, used / ALARM) / self.grip.friction
-        wanted = strength * min(max(growth, RELAXING), GROWTH)
-        wanted = min(max(wanted, self.grip.force), self.grip.most)
+        used, needed, mean, load = self._needed(felt)
+        before = self.grip.force if last is None else last.strength
+        wanted = max(needed, RELAXING * before, self.grip.force)
+        strength = min(wanted, self.grip.most)
         warm = None if last is None else last.squeeze
-        squeeze = replace(self.grip, force=wanted).solve(felt, warm=warm)
+        squeeze = replace(self.grip, force=strength).solve(felt, warm=warm)
         if squeeze.torque is None:
             if last is None:
                 raise InputError(f"Hold: {squeeze.reason}")
-            return replace(last, used=used, load=load, blind=0, reason=squeeze.reason)
+            return replace(self._kept(last, squeeze.reason), used=used, load=load)
         straining, reason = 0, ""
-        if used > self.grip.friction and not self._can_grow(squeeze, wanted):
-            straining = 1 if last is None else last.straining + 1
+        if last is not None and used > self.grip.friction and _is_all(last.squeeze, felt, mean):
+            straining = last.straining + (wanted > self.grip.most or _is_weak(squeeze))
         if straining >= self.patience:
             reason = (
                 f"a contact uses friction of {used:.2f}, {self.grip.friction:g} is believed, and "
-                f"the hand cannot press harder than {wanted:.3g} N a contact"
+                f"the hand cannot press harder than {mean:.3g} N a contact"
             )
-        return Press(squeeze.torque, wanted, squeeze, used, load, 0, straining, reason)
+        return Press(squeeze.torque, strength, squeeze, used, load, 0, straining, reason)
 
-    def _can_grow(self, squeeze: Squeeze, strength: float) -> bool:
-        weak = any(r.law == "grip strength" and r.short > ROUNDING for r in squeeze.reports)
-        return strength < self.grip.most and not weak
+    def _needed(self, felt: Grasp) -> tuple[float, float, float, float]:
+        """The largest |t_i|/a_i; the strength [N] it takes; the mean a_i [N]; the load [N].
+
+        All are 0 where no wrench is felt.
+        """
+        if any(contact.wrench is None for contact in felt.contacts):
+            return 0.0, 0.0, 0.0, 0.0
+        f = np.array([contact.wrench[:3] for contact in felt.contacts])  # type: ignore[index]
+        a = (f * felt.normals).sum(axis=1)
+        t = np.linalg.norm(f - a[:, None] * felt.normals, axis=1)
+        net, mean = f.sum(axis=0), float(a.mean())
+        used = float((t / np.maximum(a, np.finfo(float).tiny)).max())
+        shared = float(np.linalg.norm(net)) / (felt.k * RESERVE * self.grip.friction)
+        return used, max(shared, mean * used / self.grip.friction), mean, -float(net[2])
 
     def _blind(self, felt: Missed, last: Press | None) -> Press:
         if last is None:
@@ -88,22 +98,24 @@ class Hold:
                 f"Hold begins with a grasp, and nothing was felt yet: {felt.reason.value} "
                 f"({felt.where})"
             )
+        kept = self._kept(last, f"{felt.reason.value} ({felt.where})")
+        if felt.reason is Miss.BLOCKED:  # the driver stopped: it presses no more
+            return replace(kept, reason=f"{felt.reason.value} ({felt.where})")
+        return kept
+
+    def _kept(self, last: Press, why: str) -> Press:
+        """The last torques once more, which should end where that lasts."""
         blind = last.blind + 1
-        why = f"{felt.reason.value} ({felt.where})"
-        gone = blind >= self.patience or felt.reason is Miss.BLOCKED
-        return replace(last, blind=blind, reason=why if gone else last.reason)
+        return replace(last, blind=blind, reason=why if blind >= self.patience else last.reason)
 
 
-def _friction_used(grasp: Grasp) -> tuple[float, float, float]:
-    """Of the forces felt: the largest |t_i|/a_i, |Σ f_i|/Σ a_i, and the net force upwards [N].
+def _is_weak(squeeze: Squeeze) -> bool:
+    """True where limits leave less than the strength that was asked for."""
+    return any(r.law == "grip strength" and r.short > ROUNDING for r in squeeze.reports)
 
-    All are 0 where no wrench is felt.
-    """
-    if any(contact.wrench is None for contact in grasp.contacts):
-        return 0.0, 0.0, 0.0
-    f = np.array([contact.wrench[:3] for contact in grasp.contacts])  # type: ignore[index]
-    a = (f * grasp.normals).sum(axis=1)
-    t = np.linalg.norm(f - a[:, None] * grasp.normals, axis=1)
-    least, net = np.finfo(float).tiny, f.sum(axis=0)
-    used, shared = (t / np.maximum(a, least)).max(), np.linalg.norm(net) / max(a.sum(), least)
-    return float(used), float(shared), -float(net[2])
+
+def _is_all(squeeze: Squeeze, felt: Grasp, mean: float) -> bool:
+    """True where `mean` [N], a contact's normal force, is what was asked: the hand has followed."""
+    assert squeeze.forces is not None
+    asked = float(-(squeeze.forces * felt.normals).sum(axis=1).mean())
+    return mean >= FOLLOWED * asked

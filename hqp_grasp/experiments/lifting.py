@@ -11,6 +11,7 @@ from hqp_grasp.control.hold import Hold, Press
 from hqp_grasp.control.reach import carried
 from hqp_grasp.errors import InputError, instance, positive
 from hqp_grasp.grasp import Grasp, Miss, Missed
+from hqp_grasp.touch.driver import Driver, require_press
 from hqp_grasp.touch.geometric import RETREAT
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.world.robot import Robot
@@ -45,7 +46,7 @@ class Lift:
     """How it went, as far as it was felt."""
 
     moments: tuple[Moment, ...]
-    lifted: bool  # carried to the top, and there still
+    lifted: bool  # carried to the top, and held there
     set_down: bool  # felt to stand before it was let go
     weight: float  # [kg] felt at the top; NaN where it was not lifted
     reason: str = ""  # what went wrong, or why it was set down early
@@ -69,6 +70,7 @@ def lift(
     instance("lift: hold", hold, Hold)
     height = positive("lift: height", height)
     robot, driver = probe.robot, probe.driver
+    require_press("lift: the driver", driver)
     if not robot.arm:
         raise InputError(f"{robot.description.name} has no arm to lift with")
     postures = {rise: _raised(robot, grasp.q, rise) for rise in (LOOSENING, NEAR, height)}
@@ -89,27 +91,33 @@ def lift(
             looking.carry("shake", postures[height], SHAKING)
     except _UnsafeError as unsafe:
         reason = str(unsafe)
-    looking.lowering = True
-    stands = False
+    looking.lowering, stands = True, False
     try:
+        driver.press(looking.press.torque)  # once more, where the driver had stopped by itself
         looking.carry("lower", postures[NEAR], height / SPEED)
         fine = [_raised(robot, grasp.q, rise) for rise in np.arange(NEAR - FINE, 0.0, -FINE)]
         most = max((m.press.load for m in looking.moments), default=0.0)
         for q in (*fine, grasp.q, *below):
+            if q is below[0] and looking.press.blind:
+                break  # whether it stands would not be felt: where it stood is the best guess
             looking.carry("lower", q, FINING)
             stands = looking.press.blind == 0 and looking.press.load < STANDS * most
             if stands:
                 break
-        driver.press(np.zeros(robot.n))
-        driver.wait(RELEASING)
-        closing = robot.closing.sum(axis=0)
-        here = np.clip(driver.wait(0.0).q[-1], driver.limits.lower, driver.limits.upper)
-        opened = np.clip(here - RETREAT * closing, driver.limits.lower, driver.limits.upper)
-        left = driver.move(opened, OPENING)
-        driver.wait(left)
+        _let_go(driver, robot)
     except _UnsafeError as unsafe:
-        reason, lifted = str(unsafe), False
+        left = f"{unsafe}, while it was set down; the hand stands there, and was not opened"
+        reason = f"{reason}; {left}" if reason else left
     return Lift(tuple(looking.moments), lifted, stands, weight, reason)
+
+
+def _let_go(driver: Driver, robot: Robot) -> None:
+    driver.press(np.zeros(robot.n))
+    driver.wait(RELEASING)
+    here = np.clip(driver.wait(0.0).q[-1], driver.limits.lower, driver.limits.upper)
+    opened = here - RETREAT * robot.closing.sum(axis=0)
+    opened = np.clip(opened, driver.limits.lower, driver.limits.upper)
+    driver.wait(driver.move(opened, OPENING))
 
 
 @dataclass

@@ -19,6 +19,7 @@ from hqp_grasp.experiments.trial import Began, Trial, entropy_of
 from hqp_grasp.grasp import Grasp, Touch
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.simulated import SimulatedHand, Truth
+from hqp_grasp.world.physics import simulated_model
 from hqp_grasp.world.scene import Scene
 
 HELD = ("loosen", "lift", "hold", "shake")  # phases in which the object should not slip
@@ -129,7 +130,8 @@ class Pick:
         if not self.trial.scene.articulated.arm:
             name = self.trial.scene.articulated.description.name
             raise InputError(f"{name} has no arm to lift with; put it on one, or judge its grasps")
-        self._hold(self.trial.scene)  # refuses a robot that cannot press
+        self._hold(self.trial.scene)  # refuses a robot that cannot press, or not so hard,
+        simulated_model(self.trial.scene, physics, self.trial.links)  # or that is not driven
 
     @property
     def scene(self) -> Scene:
@@ -171,7 +173,7 @@ class Pick:
 
     def _hold(self, scene: Scene, grip: float = np.inf) -> Hold:
         most = min(Grip.most, SHARE * grip)
-        return Hold(Grip(scene.articulated, min(self.force, most), self.friction, most))
+        return Hold(Grip(scene.articulated, self.force, self.friction, most))
 
     def _find(self, began: Began) -> tuple[tuple[Touch, ...], tuple[Mapping[str, object], ...]]:
         """Touch until the hand has settled, gives up, or has made all its touches; their rows."""
@@ -233,10 +235,11 @@ class _Log:
         slip, turned = _apart(held)
         normal = [sum(look["normal"]) for look in self.looks if look["phase"] == "hold"]  # type: ignore[call-overload]
         aside = float(np.linalg.norm(ends.place[:3] - stood.place[:3]))
-        standing = aside < STANDS and _turned(stood.place, ends.place) < UPRIGHT
+        free = not ends.forces.any() and not ends.other_links
+        standing = free and aside < STANDS and _turned(stood.place, ends.place) < UPRIGHT
         return {
             "lifted": bool(done.lifted and rose > RISEN * height),
-            "set_down": bool(done.set_down and standing),
+            "set_down": bool(standing),
             "felt_weight": done.weight if np.isfinite(done.weight) else None,
             "height": rose,
             "slip_mm": 1e3 * slip,

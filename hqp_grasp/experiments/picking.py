@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -62,7 +62,7 @@ def main(name: str) -> None:
     about = f"Find {name} by touch, hold it, lift it, shake it and set it down where it stood."
     prog = f"python -m hqp_grasp pick {name}"
     if hasattr(module, "Arguments"):  # an object from a file, with settings among its arguments
-        with_settings = dataclasses.make_dataclass(
+        with_settings: Any = dataclasses.make_dataclass(
             "Arguments",
             [("settings", Annotated[PickSettings, tyro.conf.arg(name="")])],
             bases=(module.Arguments,),
@@ -70,6 +70,7 @@ def main(name: str) -> None:
         )
         chosen = tyro.cli(with_settings, prog=prog, description=about)
         scene, settings = chosen.scene(), chosen.settings
+        name = f"{name}-{next(v for v in vars(chosen).values() if isinstance(v, Path)).stem}"
     else:
         scene = module.scene
         settings = tyro.cli(PickSettings, prog=prog, description=about)
