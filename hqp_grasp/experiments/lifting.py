@@ -104,20 +104,22 @@ def lift(
             stands = looking.press.blind == 0 and looking.press.load < STANDS * most
             if stands:
                 break
-        _let_go(driver, robot)
+        stopped = _let_go(driver, robot)
+        left = f"let go, but not opened: {stopped}" if stopped else ""
     except _UnsafeError as unsafe:
         left = f"{unsafe}, while it was set down; the hand stands there, and was not opened"
-        reason = f"{reason}; {left}" if reason else left
+    reason = "; ".join(filter(None, (reason, left)))
     return Lift(tuple(looking.moments), lifted, stands, weight, reason)
 
 
-def _let_go(driver: Driver, robot: Robot) -> None:
+def _let_go(driver: Driver, robot: Robot) -> str:
+    """Press ever less, then open; return what stopped the hand meanwhile, empty if nothing did."""
     driver.press(np.zeros(robot.n))
     driver.wait(RELEASING)
     here = np.clip(driver.wait(0.0).q[-1], driver.limits.lower, driver.limits.upper)
     opened = here - RETREAT * robot.closing.sum(axis=0)
     opened = np.clip(opened, driver.limits.lower, driver.limits.upper)
-    driver.wait(driver.move(opened, OPENING))
+    return driver.wait(driver.move(opened, OPENING)).fault
 
 
 @dataclass

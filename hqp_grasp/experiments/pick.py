@@ -17,7 +17,7 @@ from hqp_grasp.experiments.record import kind_and_message
 from hqp_grasp.experiments.table import table_of
 from hqp_grasp.experiments.trial import Began, Trial, entropy_of
 from hqp_grasp.grasp import Grasp, Touch
-from hqp_grasp.touch.physical import PhysicalProbe
+from hqp_grasp.touch.physical import NOTICED, PhysicalProbe
 from hqp_grasp.touch.simulated import SimulatedHand, Truth
 from hqp_grasp.world.physics import simulated_model
 from hqp_grasp.world.scene import Scene
@@ -235,7 +235,7 @@ class _Log:
         slip, turned = _apart(held)
         normal = [sum(look["normal"]) for look in self.looks if look["phase"] == "hold"]  # type: ignore[call-overload]
         aside = float(np.linalg.norm(ends.place[:3] - stood.place[:3]))
-        free = not ends.forces.any() and not ends.other_links
+        free = np.linalg.norm(ends.forces, axis=1).max() < NOTICED and not ends.other_links
         standing = free and aside < STANDS and _turned(stood.place, ends.place) < UPRIGHT
         return {
             "lifted": bool(done.lifted and rose > RISEN * height),
