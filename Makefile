@@ -119,6 +119,11 @@ results: $(READY_BENCH) pictures
 	$(PY) -m hqp_grasp report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
 	cp $(RESULTS)/cylinder/convergence.png docs/images/cylinder-convergence.png
 	$(call keep,cylinder-physical,scenarios/cylinder.py --probe physical --preset loadcell --out $(RESULTS)/cylinder-physical)
+	for object in cylinder cylinder_65 hexagon irregular; do for cells in "" "--preset loadcell"; do \
+	  $(PY) -m hqp_grasp pick $$object --mass 0.5 $$cells --trials 25 --seed 2027 \
+	    --out "$(RESULTS)/pick-$$object$${cells##* }" > "$(RESULTS)/pick-$$object$${cells##* }.txt" || exit 1; \
+	done; done
+	$(call keep,picks,benchmarks/picks.py --trials 10 --seed 2028)
 	$(call keep,figures,benchmarks/figures.py)
 	$(call keep,figures-paper,benchmarks/figures.py --form paper)
 	$(call keep,damping,benchmarks/damping.py --trials 100 --seed 53)

@@ -37,6 +37,7 @@ PYTHON_ON = [
     "only-solver.md",
     "own-hand.md",
     "own-law.md",
+    "picking.md",
     "quickstart.md",
     "real-hand.md",
     "solver.md",
@@ -48,6 +49,7 @@ COMMANDS_ON = [
     "many-trials.md",
     "objects.md",
     "physics.md",
+    "picking.md",
     "quickstart.md",
     "real-hand.md",
     "results.md",
@@ -77,7 +79,7 @@ def call(arguments, monkeypatch):
     else:
         module = "hqp_grasp." + arguments[0].removesuffix(".py").replace("/", ".")
         arguments = arguments[1:]
-    if module != "hqp_grasp" or arguments[0] == "run":
+    if module != "hqp_grasp" or arguments[0] in ("run", "pick"):
         trials = "8" if "--replay" in arguments else "2"
         arguments = [*arguments, *SMALL, "--trials", trials]
     elif arguments[0] == "view":
