@@ -135,7 +135,7 @@ results: $(READY_BENCH) pictures
 	$(call judged,hexagon)
 	$(call judged,irregular)
 	$(call keep,judging,benchmarks/judging.py --grasps 12 --seed 73)
-	$(call keep,robustness,benchmarks/robustness.py --starts 20 --seed 71 --plot docs/images/robustness.png)
+	$(call keep,robustness,benchmarks/robustness.py --starts 16 --seed 71 --plot docs/images/robustness.png)
 	$(call keep,sensing,benchmarks/sensing.py --plot docs/images/sensing.png)
 	$(call keep,physics-figure5,benchmarks/physics.py figure5 --trials 20 --plot docs/images/figure5.png)
 	$(call keep,physics-closing,benchmarks/physics.py closing)
