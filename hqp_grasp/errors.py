@@ -88,7 +88,8 @@ def not_negative(name: str, value: object) -> float:
 def whole(name: str, value: object, least: int) -> int:
     """Return `value` as an int of at least `least`, else raise InputError: 2.0 and "2" are none."""
     try:
-        found = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+        flag = isinstance(value, bool | np.bool_)
+        found = None if flag else operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         found = None
     if found is None:

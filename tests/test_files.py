@@ -106,6 +106,7 @@ def test_a_study_whose_disk_is_full_is_continued_by_the_same_command(tmp_path, m
 
 
 def test_a_disk_that_is_full_when_the_figure_is_drawn_costs_the_figure_only(tmp_path, capsys):
+    pytest.importorskip("viser", reason="the replay needs the extra hqp_grasp[view]")
     settings = Settings(trials=1, probes=1, jobs=1, out=tmp_path)
     run("cylinder", SCENE, settings)
     for name in ("convergence.png", "replay.html"):
