@@ -18,7 +18,7 @@ from hqp_grasp.control.forces import NetForce
 from hqp_grasp.errors import flag, not_negative, number, one_of, positive, whole
 from hqp_grasp.world.imperfections import Fault
 
-SCENE = hg.Scene("bhand")
+SCENE, ARM = hg.Scene("bhand"), hg.Scene("wam_bhand")
 ROBOT = SCENE.articulated
 STACK = hg.ForceTask() >> hg.MomentTask()
 CONTACT = {"position": np.zeros(3), "normal": [1.0, 0.0, 0.0]}
@@ -48,7 +48,9 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.Grip: {"robot": ROBOT, "force": 0.25},
     hg.HQP: {},
     hg.HierarchyForm: {},
+    hg.Hold: {"grip": hg.Grip(ROBOT)},
     hg.Imperfections: {},
+    hg.Judge: {"scene": SCENE},
     hg.KinematicTask: {},
     hg.Level: {"A": np.eye(2), "lower": -np.ones(2), "upper": np.ones(2)},
     hg.Level.equal: {"A": np.eye(2), "b": np.ones(2)},
@@ -60,6 +62,7 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.PaperForm: {},
     hg.PhysicalProbe: {"driver": HAND, "robot": ROBOT},
     hg.Physics: {},
+    hg.Pick: {"trial": hg.Trial(ARM, STACK, probe=hg.Physics(support="pedestal"))},
     hg.PostureTask: {},
     hg.Prism: {"polygon": SQUARE},
     hg.Prism.regular: {"sides": 6, "side": 0.03},
@@ -100,6 +103,10 @@ ANSWERS = {  # what the package hands out, and what is abstract
         "Felt",
         "ForceLaw",
         "GRIP_LAWS",
+        "Judged",
+        "Lift",
+        "Picked",
+        "Press",
         "Squeeze",
         "LevelReport",
         "Limit",
@@ -109,6 +116,7 @@ ANSWERS = {  # what the package hands out, and what is abstract
         "Record",
     ),
     *("Solution", "Step", "Task", "ik_levels", "load_history", "save_history", "solvers"),
+    "lift",  # needs a hand that holds: tests/experiments/test_pick.py
 }
 NO_NUMBER = ("0.05", True, 1j, [0.05], object(), b"1", {})
 WRONG = (*NO_NUMBER, "nonsense", None, -1, 3.5, np.nan, (), [[]], np.array(["a"]), np.array([1, 2]))
