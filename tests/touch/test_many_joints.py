@@ -68,7 +68,7 @@ def scene(tmp_path_factory):
     return hg.Scene(robot=folder / "claw.toml", object=hg.Cylinder(0.04, height=0.1))
 
 
-def test_fingers_of_two_joints_touch_and_press(scene):
+def test_fingers_of_two_joints_touch_press_and_lift(scene):
     robot = scene.articulated
     assert [len(flexion) for flexion in robot.flexion] == [2, 2, 2]
     hand = hg.SimulatedHand(scene, hg.Physics(support="pedestal", mass=0.2))
@@ -86,6 +86,14 @@ def test_fingers_of_two_joints_touch_and_press(scene):
         assert hand.wait(0.1).fault == ""
     forces = hand.truth().forces
     np.testing.assert_allclose((forces * felt.normals).sum(axis=1), 4.0, rtol=0.15)
+    up = hand.wait(0.0).q[-1].copy()
+    up[0] += 0.1
+    before = hand.truth().moved
+    left = hand.carry(up, 1.0)
+    while left > -0.5:
+        assert hand.wait(0.2).fault == ""
+        left -= 0.2
+    assert hand.truth().moved - before == pytest.approx(0.1, abs=0.005)
     worst = hand.worst
     assert worst["range [rad]"] == 0.0
     assert worst["speed share"] <= 1.0 and worst["torque share"] <= 1.0
