@@ -24,7 +24,16 @@ SPEED_TOLERANCE = 1.02
 TOUCH = 0.2  # [N]
 PRESS = 1.0  # [N]
 PRESS_TOLERANCE = 0.15
-CLOSING = 0.3  # [rad/s]
+CLOSING, SWIFT = 0.3, 0.9  # [rad/s]
+CLOSING_TOLERANCE = 0.2  # share of the speed asked
+MOVING, SLOWLY, END = 0.4, 2.0, 4.0  # [s] of a move of TRAVEL, and to the end of a range
+BEYOND = 1.0  # [rad]
+HEARD = 10  # samples in which a sensor says something
+FRESH = 0.03  # [s] by which readings may be apart that are of one time
+STARTS = 0.08  # [s] in which what was called for is begun, and read
+SPEED_FITS = 0.15  # share of the way by which velocity may be off
+TURNED = np.radians(9.0)  # a sensor in its frame
+POINT = 1.5e-3  # [m] from where a tip's weight hangs, as its model has it
 PLAIN, TORQUE_NEGATED = np.ones(6), np.repeat([1.0, -1.0], 3)
 TELLING = np.radians(5.0)  # by which normals fit better, on average
 TORQUE_TOLERANCE = 0.3  # share of the largest torque
@@ -36,11 +45,13 @@ IGNORED = 0.2  # share of it that says nothing
 ENDED = 0.5  # share of what was pressed that is left, at most
 WINDOW = 0.05  # [s]
 WINDOW_TOLERANCE = 0.15  # share of the torque
+DRAGGED = 1e-3  # [m] of the tips
+BALANCE = 0.15  # share of torques that are out of balance, at most
 CARRIED = 2e-3  # [m] of the tips
 NOTHING = 3.0  # [s] for a finger to notice that it presses on nothing
 PATIENCE = 8.0  # [s] for fingers to touch
-NORMAL_TOLERANCE = np.radians(20.0)  # measured normals are given to 10°
-WEIGHT_TOLERANCE = 0.5  # share of the tip's weight
+NORMAL_TOLERANCE = np.radians(13.0)  # measured normals are given to 10°
+WEIGHT_TOLERANCE = 0.3  # share of the tip's weight
 SURE = 4.0  # standard deviations of the mean by which noise may look like an error
 
 
@@ -53,8 +64,9 @@ class Rig:
     """A driver, ready to be tested.
 
     `free` are postures in free air, in which the tips point clearly different ways; around each,
-    every joint may move by TRAVEL and fingers may open. From `open` every finger can close onto
-    something that stands still, whose outward `normals` where they meet it are known to 10°.
+    every joint may move by TRAVEL and fingers may open, and close one by one until they touch. From
+    `open` every finger can close onto something that stands still, whose outward `normals` where
+    they meet it are known to 10°.
     """
 
     driver: Driver
@@ -74,18 +86,76 @@ class Rig:
         names = tuple(point.name for point in self.robot.description.contact_points)
         object.__setattr__(self, "_names", names)
 
+    def call(self, name: str, *arguments: object) -> object:
+        """What the driver's call returns; what it raises, but a refusal, is a fault of its own."""
+        if not hasattr(self.driver, name):
+            raise DriverError(f"a call is missing: the driver has no {name}")
+        try:
+            return getattr(self.driver, name)(*arguments)
+        except HqpGraspError:
+            raise
+        except Exception as error:
+            raise DriverError(f"{name} raises {type(error).__name__}: {error}") from error
+
+    def move(self, q: np.ndarray, duration: float) -> float:
+        """Start a move; return how long it takes [s]."""
+        return self._takes("move", self.call("move", q, duration))
+
+    def carry(self, q: np.ndarray, duration: float) -> float:
+        """Start to carry; return how long it takes [s]."""
+        return self._takes("carry", self.call("carry", q, duration))
+
+    def close(self, force: float, speed: float = CLOSING) -> None:
+        """Start closing every finger."""
+        for i in range(len(self.normals)):
+            self.call("close", i, speed, force)
+
+    def _takes(self, name: str, said: object) -> float:
+        try:
+            seconds = float(said)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            seconds = np.nan
+        if not 0.0 <= seconds < np.inf:
+            raise DriverError(f"{name} returns {said!r}; it returns how long it takes [s]")
+        return seconds
+
     def go(self, q: np.ndarray, duration: float = 1.0) -> Readings:
         """Move there, calling the driver as often as its watchdog wants."""
-        return self.wait(self.driver.move(q, duration))
+        return self.wait(self.move(q, duration))
 
     def wait(self, duration: float) -> Readings:
         """Wait in slices; all readings in one."""
         slices: list[Readings] = []
         left = duration
         while left > 0.0 or not slices:
-            slices.append(self.driver.wait(min(left, 0.5 * self.driver.limits.watchdog)))
+            slices.append(self.silent(min(left, 0.5 * self.driver.limits.watchdog)))
             left -= 0.5 * self.driver.limits.watchdog
         return _joined(slices)
+
+    def silent(self, duration: float) -> Readings:
+        """Wait in one call, and return its readings if they are all there."""
+        n, k, rate = self.robot.n, len(self.normals), self.driver.rate
+        read = self.call("wait", duration)
+        if not isinstance(read, Readings):
+            raise DriverError(f"wait returns {type(read).__name__}; it returns Readings")
+        if read.q.shape[1] != n or read.wrench.shape[1] != k:
+            raise DriverError(
+                f"readings are of {read.q.shape[1]} joints and {read.wrench.shape[1]} tips; "
+                f"the robot has {n} and {k}"
+            )
+        due, got = duration * rate, len(read.time)
+        if not (1.0 - RATE_TOLERANCE) * due - 1.0 <= got <= (1.0 + RATE_TOLERANCE) * due + 1.0:
+            raise DriverError(
+                f"readings are missing: wait({duration:g}) returns {got} samples; at the stated "
+                f"{rate:g} Hz, {due:.0f} were taken meanwhile"
+            )
+        for name in ("q", "velocity", "wrench"):
+            told = np.isfinite(getattr(read, name)).any(axis=0)
+            if got >= HEARD and not told.all():
+                at = tuple(int(i) for i in np.argwhere(~told)[0])
+                of = self._names[at[0]] if name == "wrench" else self.joint(at[0])
+                raise DriverError(f"a sensor does not answer: readings of {name} of {of} are NaN")
+        return read
 
     def joint(self, j: int) -> str:
         """Name of an independent joint."""
@@ -93,7 +163,7 @@ class Rig:
 
 
 def check_driver(rig: Rig) -> None:
-    """Run every check of CHECKS; raise DriverError with all that was found."""
+    """Run every check of CHECKS; raise DriverError with all that was found, first things first."""
     faults = []
     for check in CHECKS:
         try:
@@ -106,90 +176,248 @@ def check_driver(rig: Rig) -> None:
         finally:
             rig.driver.stop()
     if faults:
-        raise DriverError("; ".join(faults))
+        raise DriverError("; ".join(dict.fromkeys(faults)))
 
 
 def samples_come_at_the_stated_rate(rig: Rig) -> None:
-    """Every sample has a time of its own, 1/rate after the one before."""
+    """`wait` returns all samples taken meanwhile, each 1/rate after the one before."""
     rig.go(rig.free[0])
-    one, other = rig.wait(0.5), rig.wait(0.5)
-    n, k = rig.robot.n, len(rig.normals)
-    if one.q.shape[1] != n or one.velocity.shape[1] != n or one.wrench.shape[1] != k:
-        raise DriverError(
-            f"readings are of {one.q.shape[1]} joints and {one.wrench.shape[1]} tips; "
-            f"the robot has {n} and {k}"
-        )
-    gaps = np.diff(np.concatenate([one.time, other.time])) * rig.driver.rate
-    if gaps.min() <= 0.0:
+    rate = rig.driver.rate
+    parts = [rig.silent(t) for t in (0.4, 0.0, 0.1, 0.4)]
+    gaps = np.diff(np.concatenate([part.time for part in parts])) * rate
+    if not gaps.min() > 0.0:
         raise DriverError("readings are stale: time stamps do not advance from sample to sample")
     if np.abs(gaps - 1.0).max() > RATE_TOLERANCE:
         raise DriverError(
-            f"readings do not come at the stated {rig.driver.rate:g} Hz: samples are "
-            f"{gaps.min() / rig.driver.rate:g} to {gaps.max() / rig.driver.rate:g} s apart"
+            f"readings do not come at the stated {rate:g} Hz: samples are "
+            f"{gaps.min() / rate:g} to {gaps.max() / rate:g} s apart"
         )
+    _must_be_well(parts[-1], "stood in free air")
+
+
+def _must_be_well(readings: Readings, after: str) -> None:
+    if readings.fault:
+        raise DriverError(f"the hand {after}, and Readings.fault says: {readings.fault}")
 
 
 def joints_go_where_they_are_sent(rig: Rig) -> None:
-    """After a move the readings are of its end, at once."""
-    flexion = [j for joints in rig.robot.flexion for j in joints]
-    for joints in (flexion, range(rig.robot.n)):  # fingers alone are quick
-        rig.go(rig.free[0])
+    """Each joint moves when it is sent, alone; readings of angle and speed are of that time."""
+    rig.go(rig.free[0])
+    rig.wait(0.2)
+    for j in np.flatnonzero(~rig.robot.idle):
         target = rig.free[0].copy()
-        target[joints] = _around(rig, target, TRAVEL)[joints]
-        before = rig.wait(0.2).q[-1]
-        arrived = rig.go(target, 0.3).q[-1]
-        _must_arrive(rig, before, target, arrived, rig.wait(0.5).q[-1])
+        target[j] = _around(rig, target, TRAVEL)[j]
+        before = rig.wait(0.1)
+        seen = rig.go(target, MOVING)
+        later = rig.wait(0.5)
+        _must_arrive(rig, before.q[-1], target, seen, later)
+        _must_fit(rig, int(j), _joined([before, seen, later]))
+        rig.go(rig.free[0], MOVING)
 
 
 def _must_arrive(
-    rig: Rig, before: np.ndarray, target: np.ndarray, arrived: np.ndarray, later: np.ndarray
+    rig: Rig, before: np.ndarray, target: np.ndarray, seen: Readings, later: Readings
 ) -> None:
-    for j in range(rig.robot.n):
-        asked = target[j] - before[j]
-        if abs(asked) < 2.0 * NEAR or abs(arrived[j] - target[j]) < NEAR:
-            continue
-        did = f"{rig.joint(j)} was sent by {asked:+.3f} rad and reads {arrived[j] - before[j]:+.3f}"
-        if abs(later[j] - before[j]) < 1e-9:
-            raise DriverError(f"readings are stale: {did}, unchanged to the last bit")
-        if abs(later[j] - target[j]) < NEAR:
-            raise DriverError(f"readings are stale: {did}, and arrives only later")
-        if (later[j] - before[j]) * asked < 0.0:
-            raise DriverError(f"wrong sign of a joint: {did}")
-        raise DriverError(f"a joint does not arrive: {did}")
+    """Raise where a joint is not at its target, or one that was not sent has moved."""
+    arrived, end = seen.q[-1], later.q[-1]
+    off = np.abs(arrived - target)
+    if not off.max() >= NEAR:
+        return
+    sent = int(np.abs(target - before).argmax())
+    j = sent if off[sent] >= NEAR else int(off.argmax())
+    asked, moved = target[j] - before[j], arrived[j] - before[j]
+    did = f"{rig.joint(j)} was sent by {asked:+.3f} rad and reads {moved:+.3f}"
+    others = np.abs(end - before)
+    others[sent] = 0.0
+    if others.max() > 0.5 * TRAVEL and abs(end[sent] - target[sent]) >= NEAR:
+        raise DriverError(
+            f"joints are exchanged: {rig.joint(sent)} was sent by "
+            f"{target[sent] - before[sent]:+.3f} rad, and {rig.joint(int(others.argmax()))} moved"
+        )
+    if j != sent:
+        raise DriverError(f"a joint moves with another: {did} when {rig.joint(sent)} was sent")
+    if abs(end[j] - before[j]) < 1e-9:
+        raise DriverError(f"readings are stale: {did}, unchanged to the last bit")
+    if abs(end[j] - target[j]) < NEAR:
+        if np.abs(later.velocity[:, j]).max() > 0.1 * TRAVEL / MOVING:
+            raise DriverError(
+                f"move takes longer than it says, or readings are stale: {did} after the "
+                f"{len(seen.time) / rig.driver.rate:.2g} s that move returned"
+            )
+        raise DriverError(f"readings are stale: {did}, and arrives only later")
+    if (end[j] - before[j]) * asked < 0.0:
+        raise DriverError(f"wrong sign of a joint: {did}")
+    raise DriverError(f"a joint does not arrive: {did}")
+
+
+def _must_fit(rig: Rig, j: int, seen: Readings) -> None:
+    """Raise where joint j's speed is not how its angle changes."""
+    dt = 1.0 / rig.driver.rate
+    change = np.diff(seen.q[:, j])
+    speed = 0.5 * (seen.velocity[1:, j] + seen.velocity[:-1, j]) * dt
+    went, told = float(seen.q[-1, j] - seen.q[0, j]), float(np.nansum(speed))
+    if not abs(told - went) < SPEED_FITS * abs(went):
+        raise DriverError(
+            f"readings of velocity are wrong: {rig.joint(j)} turned by {went:+.3f} rad, and its "
+            f"velocity says {told:+.3f}"
+        )
+    late = _centroid(np.cumsum(speed), dt) - _centroid(np.cumsum(change), dt)
+    if abs(late) > FRESH:
+        raise DriverError(
+            f"readings are stale: {rig.joint(j)}'s velocity is {late:+.3f} s behind its angle"
+        )
+    other = np.abs(np.nansum(seen.velocity, axis=0) * dt)
+    other[j] = 0.0
+    if other.max() > 0.5 * abs(went):
+        raise DriverError(
+            f"readings of velocity are wrong: {rig.joint(j)} moved, and "
+            f"{rig.joint(int(other.argmax()))}'s velocity says that it did"
+        )
+
+
+def _centroid(x: np.ndarray, dt: float) -> float:
+    """When (t,) `x` went from its first value to its last, on average [s]."""
+    return float(np.nanmean((x[-1] - x) / (x[-1] - x[0])) * len(x) * dt)
+
+
+def moves_take_the_time_they_say(rig: Rig) -> None:
+    """A move takes what was asked, or longer by a limit; it says so, starts at once, and rests."""
+    for joints in (_fingers(rig), list(np.flatnonzero(~rig.robot.idle))):
+        rig.go(rig.free[0])
+        before = rig.wait(0.2).q[-1]
+        target = rig.free[0].copy()
+        target[joints] = _around(rig, target, TRAVEL)[joints]
+        said = rig.move(target, SLOWLY)
+        if said < (1.0 - RATE_TOLERANCE) * SLOWLY:
+            raise DriverError(
+                f"move ignores its duration: it returns {said:g} s where {SLOWLY:g} s were asked"
+            )
+        moved, rest = rig.wait(said), rig.wait(0.5)
+        _must_be_well(rest, "moved in free air")
+        _must_arrive(rig, before, target, moved, rest)
+        share = (moved.q[:, joints] - before[joints]) / (target - before)[joints]
+        middle = share.mean(axis=1)
+        half = float(np.argmax(middle > 0.5)) / len(middle)
+        if not 0.2 < half < 0.8:
+            raise DriverError(
+                f"move ignores its duration: half of the way is done after {half * said:.2g} s of "
+                f"the {said:.2g} s that it returned"
+            )
+        _must_stand(rig, rest.q, "a move does not end at rest")
+    if said > SLOWLY * 1.5 and len(_fingers(rig)) == rig.robot.n:
+        raise DriverError(f"move ignores its duration: it returns {said:g} s, {SLOWLY:g} s asked")
 
 
 def stop_stops(rig: Rig) -> None:
-    """After a stop in full motion every joint stands."""
+    """After a stop in full motion every joint stands where it was."""
     rig.go(rig.free[0])
     target = _around(rig, rig.free[0], TRAVEL)
-    rig.driver.move(target, 2.0)
-    rig.wait(0.8)
-    rig.driver.stop()
+    rig.move(target, SLOWLY)
+    moving = rig.wait(0.4 * SLOWLY)
+    rig.call("stop")
     rig.wait(BRAKING)
-    _must_stand(rig, rig.wait(1.5).q, "stop is ignored")
+    standing = rig.wait(1.5)
+    _must_stand(rig, standing.q, "stop is ignored")
+    jumped = np.abs(standing.q[-1] - moving.q[-1])
+    if jumped.max() > 0.5 * TRAVEL:
+        j = int(jumped.argmax())
+        raise DriverError(
+            f"stop is not where the joints are: {rig.joint(j)} went on by {jumped[j]:.3f} rad"
+        )
 
 
 def the_watchdog_stops_the_hand(rig: Rig) -> None:
-    """A caller that falls silent for longer than the watchdog finds the hand standing."""
+    """A caller that falls silent for longer than the watchdog, and only then, ends a move."""
     rig.go(rig.free[0])
     watchdog = rig.driver.limits.watchdog
-    rig.driver.move(_around(rig, rig.free[0], TRAVEL), 3.0 * watchdog + 1.0)
-    silent = rig.driver.wait(3.0 * watchdog + 0.5)  # one call: no slices here
-    standing = silent.time > silent.time[-1] - (2.0 * watchdog + 0.5 - BRAKING)
-    about = f"limits not held: the watchdog of {watchdog:g} s does not stop the hand"
+    rig.move(_around(rig, rig.free[0], TRAVEL), 3.0 * watchdog + 1.0)
+    _must_be_well(
+        rig.silent(0.8 * watchdog), f"was left alone for 0.8 of its watchdog of {watchdog:g} s"
+    )
+    silent = rig.silent(3.0 * watchdog + 0.5)  # one call: no slices here
+    _must_end(rig, silent, "stop the hand")
+    _must_be_well(rig.go(rig.free[0]), "was moved again after its watchdog")
+
+
+def _must_end(rig: Rig, silent: Readings, what: str) -> None:
+    """Raise unless the watchdog ended what went on at the beginning of `silent`."""
+    watchdog = rig.driver.limits.watchdog
+    standing = silent.time > silent.time[0] + watchdog + BRAKING
+    about = f"limits not held: the watchdog of {watchdog:g} s does not {what}"
     _must_stand(rig, silent.q[standing], about)
     if not silent.fault:
-        raise DriverError("the watchdog stopped the hand, and Readings.fault does not say so")
+        raise DriverError(
+            f"the watchdog of {watchdog:g} s does not {what}, or Readings.fault does not say so"
+        )
 
 
 def ranges_are_kept(rig: Rig) -> None:
-    """Fingers that are sent beyond their open end stay in their range."""
-    limits, q = rig.driver.limits, rig.free[0].copy()
+    """Joints that are sent beyond either end of their range go as if they were sent to it."""
+    limits = rig.driver.limits
+    driven = ~rig.robot.idle
+    for upper in (False, True):
+        end, way = (limits.upper, 1.0) if upper else (limits.lower, -1.0)
+        for j in np.flatnonzero(driven):
+            rig.go(rig.free[0])
+            far = abs(end[j] - rig.free[0][j])
+            takes = []
+            for beyond in (0.0, BEYOND):
+                target = rig.free[0].copy()
+                target[j] = end[j] + way * beyond
+                takes.append(rig.move(target, 1e-3))
+                rig.call("stop")
+            if far > NEAR and (takes[1] / takes[0] - 1.0) * far > 2.0 * NEAR:
+                raise DriverError(
+                    f"limits not held: {rig.joint(j)} sent {BEYOND:g} rad beyond the end of its "
+                    f"range takes {takes[1]:.3g} s, and {takes[0]:.3g} s to that end"
+                )
+        _must_be_clipped(rig, np.where(driven, end, rig.free[0]), way * driven)
+    q = rig.free[0].copy()
     rig.go(q)
     flexion = [j for joints in rig.robot.flexion for j in joints]
-    q[flexion] = limits.lower[flexion] - 3.0 * TRAVEL
-    seen = np.concatenate([rig.go(q).q, rig.wait(0.5).q])
-    outside = np.maximum(limits.lower - seen, seen - limits.upper).max(axis=0)
+    opening = rig.robot.opened(q, 1.0)
+    q[flexion] = (opening - BEYOND * np.sign(rig.robot.closing.sum(axis=0)))[flexion]
+    _must_be_inside(rig, [rig.go(q), rig.wait(0.5)])
+    for i in range(len(rig.normals)):
+        rig.go(rig.free[0])
+        rig.call("close", i, SWIFT, TOUCH)
+        seen = [rig.wait(0.1)]
+        for _ in range(int(10.0 * PATIENCE)):
+            seen.append(rig.wait(0.1))
+            way = np.abs(seen[-1].q[-1] - seen[-2].q[-1])
+            if seen[-1].touched.any() or seen[-1].stalled.any() or way.max() < STANDS:
+                break
+        rig.call("stop")
+        _must_be_inside(rig, seen)
+    rig.go(rig.free[0])
+
+
+def _must_be_clipped(rig: Rig, end: np.ndarray, way: np.ndarray) -> None:
+    """Raise where joints sent beyond `end` start faster than joints sent to it."""
+    began = []
+    for beyond in (0.0, 3.0 * BEYOND):
+        rig.go(rig.free[0])
+        start = rig.wait(0.1).q[-1]
+        rig.move(end + way * beyond, END)
+        parts = [start]
+        while len(parts) < END * rig.driver.rate:
+            parts.append(rig.wait(1.0 / rig.driver.rate).q[-1])
+            if np.abs(parts[-1] - start).max() > 0.5 * TRAVEL:
+                break
+        rig.call("stop")
+        began.append(np.abs(np.array(parts) - start))
+    at = min(len(began[0]), len(began[1])) - 1
+    more = began[1][at] - began[0][at]
+    if more.max() > STANDS + 0.25 * began[0][at].max():
+        j = int(more.argmax())
+        raise DriverError(
+            f"limits not held: {rig.joint(j)} sent beyond its range goes faster than to its end"
+        )
+
+
+def _must_be_inside(rig: Rig, seen: Sequence[Readings]) -> None:
+    limits, q = rig.driver.limits, np.concatenate([part.q for part in seen])
+    outside = np.maximum(limits.lower - q, q - limits.upper).max(axis=0)
     if outside.max() > NEAR:
         j = int(outside.argmax())
         raise DriverError(
@@ -201,15 +429,14 @@ def speeds_are_kept(rig: Rig) -> None:
     """However soon a posture is asked for, no joint moves faster than its limit."""
     rig.go(rig.free[0])
     target = _around(rig, rig.free[0], TRAVEL)
-    seen = [rig.wait(rig.driver.move(q, 1e-3) + 0.2) for q in (target, rig.free[0])]
+    seen = [rig.wait(rig.move(q, 1e-3) + 0.2) for q in (target, rig.free[0])]
     rig.go(rig.open)
-    for i in range(len(rig.normals)):
-        rig.driver.close(i, 1e3, TOUCH)
+    rig.close(TOUCH, 1e3)
     seen.append(_until_touched(rig))
     rig.go(rig.open)
     for readings in seen:
-        between = np.diff(readings.q, axis=0) * rig.driver.rate
-        fastest = np.maximum(np.abs(readings.velocity).max(axis=0), np.abs(between).max(axis=0))
+        between = np.abs(np.diff(readings.q, axis=0)).max(axis=0) * rig.driver.rate
+        fastest = np.maximum(np.abs(readings.velocity).max(axis=0), between)
         share = fastest / rig.driver.limits.speed
         if share.max() > SPEED_TOLERANCE:
             j = int(share.argmax())
@@ -220,50 +447,216 @@ def speeds_are_kept(rig: Rig) -> None:
 
 
 def tips_weigh_what_they_weigh(rig: Rig) -> None:
-    """As a tip turns, the wrench changes by its weight: right sign, right frame."""
+    """As a tip turns, the wrench changes by its weight: size, sign, frame, point, finger."""
     load = payload(rig.robot)
-    felt, due, unsure = [], [], 0.0
-    for q in rig.free:
+    felt, due, unsure = [], [], np.zeros(6)
+    for q in (*rig.free, rig.open):
         rig.go(q)
         rig.wait(0.3)
         readings = rig.wait(1.0)
-        force = readings.wrench[..., :3]
-        felt.append(force.mean(axis=0))
-        due.append(weight(load, rig.robot.tip_frames(readings.q.mean(axis=0)))[:, :3])
-        spread = float(np.linalg.norm(force.std(axis=0), axis=-1).max())
-        unsure = max(unsure, SURE * spread / np.sqrt(len(force)))
-    felt_change, due_change = np.array(felt) - felt[0], np.array(due) - due[0]
+        felt.append(_mean(readings.wrench))
+        due.append(weight(load, rig.robot.tip_frames(_mean(readings.q))))
+        spread = np.nanstd(readings.wrench, axis=0).max(axis=0)
+        unsure = np.maximum(unsure, SURE * spread / np.sqrt(len(readings.time)))
+    noise, turning = float(np.linalg.norm(unsure[:3])), float(np.linalg.norm(unsure[3:]))
+    change, wanted = np.array(felt) - np.mean(felt, axis=0), np.array(due) - np.mean(due, axis=0)
+    k = len(rig._names)
+    fits = np.array(
+        [[np.linalg.norm(change[:, i, :3] - wanted[:, j, :3]) for j in range(k)] for i in range(k)]
+    )
     for i, name in enumerate(rig._names):
-        change, wanted = felt_change[1:, i], due_change[1:, i]
-        size = float(np.linalg.norm(wanted))
-        if size < 2.0 * unsure:
+        f, w, m = change[:, i, :3], wanted[:, i, :3], change[:, i, 3:]
+        size = float(np.linalg.norm(w))
+        if size < 2.0 * noise:
             continue  # lost in noise: what touches tells signs and frames
-        share = float((change * wanted).sum()) / size**2
-        rest = float(np.linalg.norm(change - wanted)) / size
-        if rest <= WEIGHT_TOLERANCE + unsure / size:
-            continue
-        if share < -WEIGHT_TOLERANCE:
+        allowed = noise / size
+        for j in range(k):
+            both = max(fits[i, j], fits[j, i])
+            if j != i and both < 0.1 * size + noise and fits[i, i] > 3.0 * both + noise:
+                raise DriverError(
+                    f"wrenches are exchanged: {name} weighs what {rig._names[j]} does, as they turn"
+                )
+        U, _, Vt = np.linalg.svd(w.T @ f)
+        R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        angle = float(np.arccos(np.clip((np.trace(R) - 1.0) / 2.0, -1.0, 1.0)))
+        share, scale = float((f * w).sum()) / size**2, float(np.linalg.norm(f)) / size
+        rest = float(np.linalg.norm(f - w)) / size
+        if share < 0.0 and np.linalg.norm(f + w) < (WEIGHT_TOLERANCE + allowed) * size:
             raise DriverError(
                 f"wrong sign: {name} weighs {share:.2f} of its weight; the wrench is the one "
                 "that the world applies to the tip"
             )
+        if abs(scale - 1.0) > WEIGHT_TOLERANCE + allowed:
+            raise DriverError(
+                f"wrong size: {name} weighs {scale:.2f} of its weight as it turns; forces are in N"
+            )
+        if min(angle, rest) > TURNED + allowed:
+            raise DriverError(
+                f"wrong frame: as {name} turns, its weight is {np.degrees(angle):.0f}° off where "
+                f"it points ({share:.2f} of it turns as it should); the wrench is in the tip's own "
+                "frame"
+            )
+        if rest > WEIGHT_TOLERANCE + allowed:
+            raise DriverError(
+                f"wrong size: as {name} turns, its axes weigh "
+                f"{np.round((f * w).sum(axis=0) / (w * w).sum(axis=0), 2)} of its weight"
+            )
+        m = m - np.cross(load[1][i], f)
+        A = np.concatenate([-_cross_matrix(row) for row in f])
+        off = np.linalg.lstsq(A, m.ravel(), rcond=1e-3)[0]
+        if np.linalg.norm(off) > POINT + turning / size:
+            raise DriverError(
+                f"wrong point: the weight of {name} acts {1e3 * np.linalg.norm(off):.1f} mm off "
+                "where it hangs; the torque is about the tip's centre"
+            )
+
+
+def _cross_matrix(v: np.ndarray) -> np.ndarray:
+    """[v]×, for which [v]× x = v × x."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _mean(samples: np.ndarray) -> np.ndarray:
+    """Mean over time, of what sensors told."""
+    return np.asarray(np.nanmean(samples, axis=0))
+
+
+def fingers_close_one_by_one(rig: Rig) -> None:
+    """`close` closes its finger alone, at its speed, to its force; it feels and says so."""
+    k, rate = len(rig.normals), rig.driver.rate
+    for i, name in enumerate(rig._names):
+        rig.go(rig.open)
+        rig.wait(0.3)
+        before = rig.wait(0.3)
+        force = min((1.0 + 0.5 * (i % 2)) * PRESS, rig.driver.limits.hold)
+        speed = CLOSING / (1.0 + 0.5 * (i % 2))
+        rig.call("close", i, speed, force)
+        parts: list[Readings] = []
+        while len(parts) < PATIENCE * rate and not (parts and parts[-1].touched.any()):
+            parts.append(rig.silent(1.0 / rate))
+            if parts[-1].fault:
+                break
+        seen = _joined(parts)
+        _must_close_alone(rig, i, before, seen)
+        _must_close_at(rig, i, speed, seen)
+        later = rig.wait(1.0)
+        _must_feel_alone(rig, i, force, before, seen, later)
+        held = rig.wait(0.3)
+        _must_be_well(held, f"closed {name} onto a thing")
+        _must_hold(rig, "close", i, force, before, held)
+        more = min(2.0 * force, rig.driver.limits.hold)
+        rig.call("hold", more)
+        rig.wait(1.0)
+        again = rig.wait(0.3)
+        _must_hold(rig, "hold", i, more, before, again)
+        others = [j for w in np.delete(rig.robot.closing, i, axis=0) for j in np.flatnonzero(w)]
+        moved = np.abs(again.q[-1] - held.q[-1])
+        if moved[others].max(initial=0.0) > NEAR or again.touched.sum() != 1:
+            raise DriverError(f"hold moves fingers that have not touched: only {name} had")
+        if again.stalled[i] or k != len(again.touched):
+            raise DriverError(f"flags are wrong: {name} touched, and is said to have stalled")
+
+
+def _must_close_alone(rig: Rig, i: int, before: Readings, seen: Readings) -> None:
+    closing, name = rig.robot.closing, rig._names[i]
+    went = np.array([(seen.q - before.q[-1]) @ w / (w @ w) for w in closing]).T
+    far = np.abs(went).max(axis=0)
+    others = np.flatnonzero((far > 2.0 * NEAR) & (np.arange(len(far)) != i))
+    if len(others):
+        which = ", ".join(rig._names[j] for j in others)
+        alone = "with it" if far[i] > 2.0 * NEAR else "in its place"
+        raise DriverError(f"close closes the wrong finger: {name} was told, {which} moved {alone}")
+    touched = seen.touched
+    if seen.fault:
+        raise DriverError(f"close: {name} was closed, and the hand stopped itself: {seen.fault}")
+    if far[i] < 2.0 * NEAR and touched.any() and len(seen.time) < 0.1 * rig.driver.rate:
+        raise DriverError(f"flags are wrong: {name} is said to have touched before it moved")
+    if went[-1, i] < -2.0 * NEAR:
+        raise DriverError(f"close opens: {name} went by {went[-1, i]:+.3f} of its closing")
+    for j, other in enumerate(rig._names):
+        if j != i and touched[j]:
+            raise DriverError(
+                f"flags are exchanged: {name} was closed, and {other} is said to have touched"
+            )
+    if not touched[i]:
+        raise DriverError(f"close does not end at a touch: {name} did not")
+
+
+def _must_close_at(rig: Rig, i: int, speed: float, seen: Readings) -> None:
+    """Raise unless finger i started at once, and closed at that speed [rad/s]."""
+    rate, joints = rig.driver.rate, np.flatnonzero(rig.robot.closing[i])
+    way = np.abs(seen.q[:, joints] - seen.q[0, joints])
+    j = int(np.argmax(way[-1]))
+    way = way[:, j]
+    last = len(way) - max(2, round(0.05 * rate))  # the touch itself brakes
+    first = int(np.argmax(way > NEAR))
+    if last - first < 0.1 * rate:
+        return
+    started = (first + 1) / rate - NEAR / speed
+    took = (last - first) / rate
+    fast = float(way[last] - way[first]) / took
+    if abs(fast / speed - 1.0) > CLOSING_TOLERANCE:
         raise DriverError(
-            f"wrong frame: as {name} turns, its weight does not turn with it ({share:.2f} of it "
-            f"does, {rest:.2f} are off); the wrench is in the tip's own frame"
+            f"close ignores its speed: {speed:g} rad/s was asked for, and {rig._names[i]} closed "
+            f"at {fast:.2g}"
         )
+    if started > STARTS:
+        raise DriverError(
+            f"readings are stale: {rig._names[i]} was told to close, and reads so {started:.2f} s "
+            "later"
+        )
+
+
+def _must_feel_alone(
+    rig: Rig, i: int, force: float, before: Readings, seen: Readings, later: Readings
+) -> None:
+    """Raise unless finger i, and no other, feels when it is said to have touched."""
+    rate, base, name = rig.driver.rate, _mean(before.wrench)[:, :3], rig._names[i]
+    upto = _joined([seen, later])
+    felt = np.linalg.norm(upto.wrench[..., :3] - base, axis=-1)
+    at = len(seen.time) - 1
+    settled = np.median(felt[at + round(0.5 * rate) :], axis=0)
+    for j, other in enumerate(rig._names):
+        if j != i and settled[j] > 0.5 * force:
+            also = "exchanged" if settled[i] < 0.5 * settled[j] else "mixed"
+            raise DriverError(f"wrenches are {also}: {name} touches alone, and {other} feels it")
+    first = int(np.argmax(felt[:, i] > 0.5 * min(force, settled[i])))
+    late = (first - at) / rate
+    if late > FRESH:
+        raise DriverError(
+            f"readings of the wrench are stale: {name} is said to have touched, and feels it "
+            f"{late:.2f} s later"
+        )
+
+
+def _must_hold(rig: Rig, call: str, i: int, force: float, before: Readings, held: Readings) -> None:
+    """Raise unless finger i reads `force` [N], as its motors do."""
+    f = _pushed(rig, before, held)[i, :3]
+    size, name, q = float(np.linalg.norm(f)), rig._names[i], _mean(held.q)
+    off = abs(size - force)
+    if off <= PRESS_TOLERANCE * force:
+        return
+    R = rig.robot.tip_frames(q)[i]
+    J = rig.robot.link_jacobian(q, i, _places(rig, q)[i])
+    joints = np.flatnonzero(rig.robot.closing[i])
+    due = -(J.T @ (R @ f))[joints] / size  # by 1 N
+    motors = held.torque.mean(axis=0)[joints] @ due / (due @ due)
+    said = f"{call}: {name} was asked for {force:g} N and reads {size:.3g} N"
+    if abs(motors - force) < PRESS_TOLERANCE * force:
+        raise DriverError(f"wrong size of the wrench: {said}; its motors hold {motors:.2g} N")
+    raise DriverError(f"{said}; its motors hold {motors:.2g} N")
 
 
 def closing_ends_at_a_touch(rig: Rig) -> None:
     """Every finger finds the thing, and feels it push the way it lies."""
     before, held = _held(rig)
-    R_world_tip = rig.robot.tip_frames(held.q.mean(axis=0)).copy()
+    R_world_tip = rig.robot.tip_frames(_mean(held.q)).copy()
     pushed = _pushed(rig, before, held)
     better = []
     for i, (name, R) in enumerate(zip(rig._names, R_world_tip, strict=True)):
+        _must_hold(rig, "hold", i, PRESS, before, held)
         f = R @ pushed[i, :3]
         size = float(np.linalg.norm(f))
-        if abs(size - PRESS) > PRESS_TOLERANCE * PRESS:
-            raise DriverError(f"hold: {name} was asked for {PRESS:g} N and reads {size:.3g} N")
         if float(f @ rig.normals[i]) < -0.5 * size:
             raise DriverError(
                 f"wrong sign: the thing seems to pull at {name}; the wrench is the one that the "
@@ -292,18 +685,17 @@ def _off(rig: Rig, i: int, R: np.ndarray, pushed: np.ndarray) -> float:
     return float(np.arccos(np.clip(normal @ rig.normals[i], -1.0, 1.0)))
 
 
-def _held(rig: Rig) -> tuple[Readings, Readings]:
-    """Readings of open fingers, and of when all of them hold PRESS."""
+def _held(rig: Rig, force: float = PRESS) -> tuple[Readings, Readings]:
+    """Readings of open fingers, and of when all of them hold `force` [N]."""
     rig.go(rig.open)
     rig.wait(0.3)
     before = rig.wait(0.3)
-    for i in range(len(rig.normals)):
-        rig.driver.close(i, CLOSING, TOUCH)
+    rig.close(TOUCH)
     closed = _until_touched(rig)
     if not closed.touched.all():
         names = [n for n, t in zip(rig._names, closed.touched, strict=True) if not t]
         raise DriverError(f"close does not end at a touch: {', '.join(names)} did not")
-    rig.driver.hold(PRESS)
+    rig.call("hold", force)
     rig.wait(1.0)
     return before, rig.wait(0.3)
 
@@ -311,9 +703,102 @@ def _held(rig: Rig) -> tuple[Readings, Readings]:
 def _pushed(rig: Rig, before: Readings, now: Readings) -> np.ndarray:
     """The mean wrench (k, 6) beside the tips' own weight, each in its tip's frame."""
     load, robot = payload(rig.robot), rig.robot
-    pushed = now.wrench.mean(axis=0) - before.wrench.mean(axis=0)
-    pushed -= weight(load, robot.tip_frames(now.q.mean(axis=0)))
-    return np.asarray(pushed + weight(load, robot.tip_frames(before.q.mean(axis=0))))
+    pushed = _mean(now.wrench) - _mean(before.wrench)
+    pushed -= weight(load, robot.tip_frames(_mean(now.q)))
+    return np.asarray(pushed + weight(load, robot.tip_frames(_mean(before.q))))
+
+
+def closing_and_holding_end(rig: Rig) -> None:
+    """A stop, a move, and a caller that falls silent end closing and holding, of every finger."""
+    watchdog = rig.driver.limits.watchdog
+    rig.go(rig.open)  # what was touched is left first
+    rig.go(rig.free[0])
+    rig.close(TOUCH, TRAVEL / (3.0 * watchdog + 0.5))
+    _must_end(rig, rig.silent(3.0 * watchdog + 0.5), "end closing")
+    rig.go(rig.free[0])
+    rig.close(TOUCH, 0.5 * CLOSING)
+    rig.wait(0.3)
+    rig.call("stop")
+    rig.wait(BRAKING)
+    _must_stand(rig, rig.wait(0.5).q, "stop does not end closing")
+    rig.close(TOUCH, 0.5 * CLOSING)
+    rig.wait(0.1)
+    rig.go(rig.free[0])
+    _must_rest(rig, rig.free[0], "move does not end closing")
+    for ends in ("stop", "move", "the watchdog"):
+        before, held = _held(rig)
+        was = np.linalg.norm(_pushed(rig, before, held)[:, :3], axis=1)
+        if ends == "stop":
+            rig.call("stop")
+        elif ends == "move":
+            rig.go(np.clip(held.q[-1], rig.driver.limits.lower, rig.driver.limits.upper), 0.1)
+        else:
+            silent = rig.silent(watchdog + 0.5)
+            if not silent.fault:
+                raise DriverError(
+                    f"the watchdog of {watchdog:g} s does not end holding, or Readings.fault does "
+                    "not say so"
+                )
+        with suppress(InputError):  # nothing is held: a driver may refuse
+            rig.call("hold", min(3.0 * PRESS, rig.driver.limits.hold))
+        rig.wait(1.0)
+        now = rig.wait(0.3)
+        left = np.linalg.norm(_pushed(rig, before, now)[:, :3], axis=1)
+        more = left - np.maximum(was, PRESS)
+        if more.max() > 0.5 * PRESS:
+            raise DriverError(
+                f"{ends} does not end holding: {rig._names[int(more.argmax())]} goes on, and was "
+                f"told to hold more after it"
+            )
+        rig.go(rig.open)
+        _must_rest(rig, rig.open, "move does not end holding")
+
+
+def _must_rest(rig: Rig, q: np.ndarray, about: str) -> None:
+    """Raise unless the hand is well, at q, where it stands."""
+    rest = rig.wait(0.5)
+    _must_be_well(rest, "was moved away")
+    off = np.abs(rest.q - q).max(axis=0)
+    if off.max() > 2.0 * NEAR:
+        j = int(off.argmax())
+        raise DriverError(f"{about}: {rig.joint(j)} is {off[j]:.3f} rad beside where it was sent")
+    _must_stand(rig, rest.q, about)
+    if rest.touched.any():
+        name = rig._names[int(rest.touched.argmax())]
+        raise DriverError(f"{about}: {name} is still said to have touched")
+
+
+def what_is_too_much_is_refused(rig: Rig) -> None:
+    """What may not be asked raises InputError, and nothing moves."""
+    rig.go(rig.open)  # what was touched is left first
+    rig.go(rig.free[0])
+    rig.wait(0.3)
+    limits, zeros = rig.driver.limits, np.zeros(rig.robot.n)
+    asked: list[tuple[str, str, tuple[object, ...]]] = [
+        ("hold", f"holding more than {limits.hold:g} N", (1.1 * limits.hold,)),
+        ("close", f"closing with more than {limits.hold:g} N", (0, CLOSING, 1.1 * limits.hold)),
+    ]
+    if limits.grip > 0.0:
+        asked.append(("carry", "carrying while nothing is pressed", (rig.free[0], 0.5)))
+        for j in _fingers(rig):
+            torque = zeros.copy()
+            torque[j] = 1.1 * limits.torque[j]
+            what = f"pressing with {torque[j]:.3g} N·m of {limits.torque[j]:.3g} at {rig.joint(j)}"
+            asked.append(("press", what, (torque,)))
+        for j in rig.robot.arm:
+            torque = zeros.copy()
+            torque[j] = 0.1 * limits.torque[j]
+            asked.append(("press", f"pressing with {rig.joint(j)}, which carries", (torque,)))
+    for call, what, arguments in asked:
+        try:
+            rig.call(call, *arguments)
+        except InputError:
+            continue
+        rig.call("stop")
+        raise DriverError(f"{call}: {what} is not refused by InputError")
+    stood = rig.wait(0.5)
+    _must_stand(rig, stood.q, "what was refused moves the hand")
+    _must_be_well(stood, "refused what was too much")
 
 
 def contact_forces_are_kept(rig: Rig) -> None:
@@ -322,14 +807,13 @@ def contact_forces_are_kept(rig: Rig) -> None:
     rig.go(rig.open)
     rig.wait(0.3)
     before = rig.wait(0.3).wrench[..., :3].mean(axis=0)
-    for i in range(len(rig.normals)):
-        rig.driver.close(i, CLOSING, TOUCH)
+    rig.close(TOUCH)
     seen = [_until_touched(rig)]
-    rig.driver.hold(limits.hold)
+    rig.call("hold", limits.hold)
     seen += [rig.wait(0.5 + 0.5 * limits.hold), rig.wait(0.3)]
     held = np.linalg.norm(seen[-1].wrench[..., :3].mean(axis=0) - before, axis=-1)
     with suppress(InputError):  # a driver may refuse
-        rig.driver.hold(1e3 * limits.force)
+        rig.call("hold", 1e3 * limits.force)
     seen.append(rig.wait(2.0))
     rig.go(rig.open)
     _must_stay_below("a fingertip felt", seen, limits.force)
@@ -351,15 +835,43 @@ def _must_stay_below(what: str, seen: Sequence[Readings], limit: float) -> None:
 
 
 def torques_are_those_that_fingers_hold_with(rig: Rig) -> None:
-    """The motors' torques are in balance with what the tips feel."""
+    """The motors' torques are in balance with what the tips feel, finger by finger, in time."""
     before, held = _held(rig)
-    q = held.q.mean(axis=0)
-    felt = _pushed(rig, before, held)
+    _must_balance(rig, "holding", before, held)
+    rig.call("hold", rig.driver.limits.hold)
+    rising = rig.wait(0.5 + 0.3 * rig.driver.limits.hold)
+    after = rig.wait(0.5)
+    _must_balance(rig, "holding", before, after)
+    whole, dt, q = _joined([held, rising, after]), 1.0 / rig.driver.rate, _mean(after.q)
+    frames, places = rig.robot.tip_frames(q).copy(), _places(rig, q)
+    for i, name in enumerate(rig._names):
+        way = rig.robot.closing[i] @ rig.robot.link_jacobian(q, i, places[i]).T @ frames[i]
+        late = _rise(-whole.wrench[:, i, :3] @ way, dt) - _rise(
+            whole.torque @ rig.robot.closing[i], dt
+        )
+        if abs(late) > FRESH:
+            which = "the wrench is" if late > 0.0 else "the motors' torque is"
+            raise DriverError(
+                f"readings are stale: of {name}, {which} {abs(late):.2f} s behind the other"
+            )
+
+
+def _rise(x: np.ndarray, dt: float) -> float:
+    """When (t,) `x` went from how it begins to how it ends, on average [s]."""
+    n = max(1, round(0.2 / dt))
+    first, last = np.nanmean(x[:n]), np.nanmean(x[-n:])
+    return float(np.nansum((last - x) / (last - first)) * dt)
+
+
+def _must_balance(rig: Rig, what: str, before: Readings, now: Readings) -> None:
+    q = _mean(now.q)
+    felt = _pushed(rig, before, now)
     frames, places = rig.robot.tip_frames(q).copy(), _places(rig, q)
     due = np.zeros(rig.robot.n)
     for i, R in enumerate(frames):
         due -= rig.robot.link_jacobian(q, i, places[i]).T @ (R @ felt[i, :3])
-    _must_read(rig, "holding", due, held.torque.mean(axis=0))
+    read = now.torque.mean(axis=0) - before.torque.mean(axis=0)
+    _must_read(rig, what, due, read)
 
 
 def _must_read(rig: Rig, what: str, due: np.ndarray, read: np.ndarray) -> None:
@@ -405,7 +917,7 @@ def _pressed(rig: Rig, firmly: bool) -> tuple[Readings, tuple[float, float], Rea
     alone = np.array([_torque(rig, q, one) for one in np.eye(k)])  # by 1 N
     firm = min(FIRM * limits.grip, HALF / float((np.abs(alone) / limits.torque).max()))
     force = firm if firmly else LIGHT * firm
-    rig.driver.press(force * alone.sum(axis=0))
+    rig.call("press", force * alone.sum(axis=0))
     rig.wait(FOLLOWS)
     pressed = rig.wait(0.3)
     got = _inwards(rig, before, pressed)
@@ -432,7 +944,7 @@ def pressing_is_followed_slowly(rig: Rig) -> None:
     more = firm - light
     for i, name in enumerate(rig._names):
         torque = _torque(rig, q, np.where(np.arange(k) == i, firm, light))
-        rig.driver.press(torque)
+        rig.call("press", torque)
         rising = rig.wait(FOLLOWS)
         pressed = rig.wait(0.3)
         if pressed.fault:
@@ -447,7 +959,7 @@ def pressing_is_followed_slowly(rig: Rig) -> None:
             raise DriverError(f"press turns the wrong joint: {said}")
         _must_read(rig, f"when {name} presses", torque, pressed.torque.mean(axis=0))
         _must_rise_slowly(rig, rising, i, torque)
-        rig.driver.press(_torque(rig, q, np.full(k, light)))
+        rig.call("press", _torque(rig, q, np.full(k, light)))
         rig.wait(FOLLOWS)
     if rig.robot.arm:
         stood = np.abs(rig.wait(0.1).q[-1] - arm)[list(rig.robot.arm)]
@@ -473,9 +985,9 @@ def pressing_ends(rig: Rig) -> None:
     before, (light, firm), pressed = _pressed(rig, firmly=False)
     q, k = pressed.q.mean(axis=0), len(rig.normals)
     more = _torque(rig, q, np.full(k, firm))
-    rig.driver.press(more)
-    rig.driver.wait(0.25 * (1.0 - LIGHT) * float(np.abs(more).max()) / PRESS_RATE)
-    rig.driver.stop()  # on the way: a stiff hand that stands may be as tight as it was
+    rig.call("press", more)
+    rig.silent(0.25 * (1.0 - LIGHT) * float(np.abs(more).max()) / PRESS_RATE)
+    rig.call("stop")  # on the way: a stiff hand that stands may be as tight as it was
     rig.wait(FOLLOWS)
     left = _inwards(rig, before, rig.wait(0.3))
     if (left > light + FOLLOWED * (firm - light)).any():
@@ -493,7 +1005,7 @@ def pressing_ends(rig: Rig) -> None:
             f"with {np.round(left, 2)} N"
         )
     _pressed(rig, firmly=True)
-    if not rig.driver.wait(rig.driver.limits.watchdog + 0.5).fault:
+    if not rig.silent(rig.driver.limits.watchdog + 0.5).fault:
         raise DriverError(
             "press does not end at the watchdog: nobody called for longer than that, and "
             "Readings.fault says nothing"
@@ -502,10 +1014,11 @@ def pressing_ends(rig: Rig) -> None:
 
 def pressing_on_nothing_stops(rig: Rig) -> None:
     """Fingers that are pressed open in free air stop the hand, and were not too fast."""
+    rig.go(rig.open)  # what was touched is left first
     rig.go(rig.free[0])
     closing = rig.robot.closing.sum(axis=0)
     share = np.where(closing != 0.0, np.abs(closing) / rig.driver.limits.torque, 0.0).max()
-    rig.driver.press(-0.3 * closing / share)
+    rig.call("press", -0.3 * closing / share)
     seen = rig.wait(NOTHING)
     fastest = np.abs(seen.velocity).max(axis=0) / rig.driver.limits.speed
     if fastest.max() > SPEED_TOLERANCE:
@@ -523,7 +1036,7 @@ def carrying_keeps_what_is_pressed(rig: Rig) -> None:
     """The arm goes where it is carried, and the fingers press on, whatever is asked of them."""
     rig.go(rig.open)
     with suppress(InputError):
-        rig.driver.carry(rig.open, 0.5)
+        rig.carry(rig.open, 0.5)
         raise DriverError("carry: a hand that presses nothing was carried; it raises InputError")
     before, _, pressed = _pressed(rig, firmly=True)
     was, q = _inwards(rig, before, pressed), pressed.q.mean(axis=0)
@@ -535,7 +1048,7 @@ def carrying_keeps_what_is_pressed(rig: Rig) -> None:
         j = min(rig.robot.arm, key=lambda joint: float(way[joint]))
         by = min(CARRIED / max(float(way[j]), 1e-3), TRAVEL)
         target[j] += by if target[j] + by <= rig.driver.limits.upper[j] else -by
-    moved = rig.wait(rig.driver.carry(target, 0.5) + 0.3)
+    moved = rig.wait(rig.carry(target, 0.5) + 0.3)
     rest = rig.wait(0.3)
     if rest.fault:
         raise DriverError(f"carry: the hand stopped itself: {rest.fault}")
@@ -559,29 +1072,163 @@ def grip_forces_are_kept(rig: Rig) -> None:
     seen = [pressed]
     for share in (1.0, 2.0):
         with suppress(InputError):  # a driver may refuse what is beyond its torque limit
-            rig.driver.press(share * torque / room.max())
+            rig.call("press", share * torque / room.max())
         seen.append(rig.wait(2.0))
-    rig.driver.stop()
+    rig.call("stop")
     rig.go(rig.open)
     _must_stay_below("pressing, a fingertip felt", seen, limits.grip)
+
+
+def wrenches_agree_with_all_else(rig: Rig) -> None:
+    """However a touch is pressed and dragged, its wrench tells the same contact, and balances."""
+    before, (light, firm), now = _pressed(rig, firmly=False)
+    q, k = _mean(now.q), len(rig.normals)
+    seen = [now]
+    for i in range(k):
+        rig.call("press", _torque(rig, q, np.where(np.arange(k) == i, 0.5 * (light + firm), light)))
+        rig.wait(FOLLOWS)
+        seen.append(rig.wait(0.3))
+    across = [j for j in _fingers(rig) if not rig.robot.closing[:, j].any()]
+    even = _torque(rig, q, np.full(k, light))
+    for j in across:  # sideways, by half of what friction of 0.5 bears
+        arm = np.linalg.norm(rig.robot.jacobian(q).reshape(k, 3, -1)[..., j], axis=1).max()
+        for way in (1.0, -1.0):
+            torque = even.copy()
+            torque[j] += way * min(0.25 * light * arm, HALF * rig.driver.limits.torque[j])
+            rig.call("press", torque)
+            rig.wait(FOLLOWS)
+            seen.append(rig.wait(0.3))
+    rig.call("press", even)
+    rig.wait(FOLLOWS)
+    for j in rig.robot.arm:
+        arm = np.linalg.norm(rig.robot.jacobian(q).reshape(k, 3, -1)[..., j], axis=1).max()
+        for way in (1.0, -1.0, 0.0):
+            target = q.copy()
+            target[j] += way * min(DRAGGED / max(arm, 1e-3), TRAVEL)
+            rig.wait(rig.carry(target, 0.3) + 0.2)
+            seen.append(rig.wait(0.2))
+    rig.call("stop")
+    rig.go(rig.open)
+    fault = next((part.fault for part in seen if part.fault), "")
+    if fault:
+        raise DriverError(f"press: {light:.2g} N at each tip stopped the hand: {fault}")
+    for i in range(k):
+        _must_tell_one_contact(rig, i, before, seen)
+    _must_balance_always(rig, before, seen)
+
+
+def _must_tell_one_contact(rig: Rig, i: int, before: Readings, seen: Sequence[Readings]) -> None:
+    """Raise unless finger i's wrenches, all at one contact, tell one normal near the thing's."""
+    name, radius = rig._names[i], float(rig.robot.tip_radius[i])
+    frames = [rig.robot.tip_frames(_mean(part.q))[i].copy() for part in seen]
+    felt = np.array([_pushed(rig, before, part)[i] for part in seen])
+
+    def spread(scale: float, about: np.ndarray) -> float:
+        """How far [rad] the worst normal is from the thing's, with torques so corrected."""
+        off = 0.0
+        for R, w in zip(frames, felt, strict=True):
+            torque = scale * w[3:] - np.cross(about, w[:3])
+            off = max(off, _off(rig, i, R, np.concatenate([w[:3], torque])))
+        return off
+
+    plain = spread(1.0, np.zeros(3))
+    if plain < NORMAL_TOLERANCE:
+        return
+    said = f"as {name} is pressed and dragged, it feels normals up to {np.degrees(plain):.0f}° off"
+    for scale, what in ((-1.0, "is negated"), (2.0, "is halved"), (0.5, "is doubled")):
+        if spread(scale, np.zeros(3)) < 0.5 * NORMAL_TOLERANCE:
+            raise DriverError(f"wrong torque of the wrench: {said}, as if its torque {what}")
+    forces, torques = felt[:, :3], felt[:, 3:]
+    size = np.linalg.norm(forces, axis=1).max() * radius
+    if np.linalg.norm(torques, axis=1).max() < 0.05 * size:
+        raise DriverError(f"wrong torque of the wrench: {said}; its torque is 0")
+    places = -radius * np.einsum("tab,a->tb", np.array(frames), rig.normals[i])
+    left = torques - np.cross(places, forces)
+    A = np.concatenate([-_cross_matrix(f) for f in forces])
+    about = np.linalg.lstsq(A, left.ravel(), rcond=1e-3)[0]
+    if spread(1.0, about) < 0.5 * plain:
+        raise DriverError(
+            f"wrong point: {said}, as if the torque were about a point "
+            f"{1e3 * np.linalg.norm(about):.1f} mm from the tip's centre"
+        )
+    raise DriverError(f"wrong frame, or torque, of the wrench: {said}")
+
+
+def _must_balance_always(rig: Rig, before: Readings, seen: Sequence[Readings]) -> None:
+    """Raise where torques are no balance of the wrenches; name the joint or the finger."""
+    k, n, joints = len(rig.normals), rig.robot.n, np.flatnonzero(~rig.robot.idle)
+    read, parts = [], []
+    base = before.torque.mean(axis=0)
+    for part in seen:
+        q = _mean(part.q)
+        frames, places, felt = (
+            rig.robot.tip_frames(q).copy(),
+            _places(rig, q),
+            _pushed(rig, before, part),
+        )
+        J = np.array([rig.robot.link_jacobian(q, i, places[i]).T @ frames[i] for i in range(k)])
+        parts.append(-np.einsum("knb,kc->kncb", J, felt[:, :3]).reshape(k, n, 9))
+        read.append(part.torque.mean(axis=0) - base)
+    tau, X = np.array(read), np.array(parts)  # (t, n), (t, k, n, 9): τ = Σ X_i vec(A_i), A_i = 1
+    due = (X @ np.eye(3).ravel()).sum(axis=1)
+    size = np.sqrt((due**2).mean(axis=0))
+    off = np.sqrt(((tau - due) ** 2).mean(axis=0))
+    group = np.where(np.isin(np.arange(n), rig.robot.arm), 0, 1)
+    least = np.array([size[(group == g) & ~rig.robot.idle].max() for g in group])
+    share = off / (size + 0.2 * least)
+    if not share[joints].max() > BALANCE:
+        return
+    # Which finger's force, turned or stretched, or which joint's torque alone explains it?
+    weigh = 1.0 / (size + 0.2 * least)
+    wrong = []
+    for i in range(k):
+        rest = tau - due + X[:, i] @ np.eye(3).ravel()
+        A = (X[:, i] * weigh[:, None])[:, joints].reshape(-1, 9)
+        y = (rest * weigh)[:, joints].ravel()
+        eye = np.eye(3).ravel()
+        lam = 0.05 * np.sqrt((A**2).sum(axis=0).max())
+        fit = np.linalg.lstsq(
+            np.concatenate([A, lam * np.eye(9)]), np.concatenate([y, lam * eye]), rcond=None
+        )[0]
+        wrong.append((float(np.sqrt(np.mean((A @ fit - y) ** 2))), fit.reshape(3, 3)))
+    j = int(joints[share[joints].argmax()])
+    others = [share[o] for o in joints if o != j]
+    i = int(np.argmin([w[0] for w in wrong]))
+    if max(others, default=0.0) < 0.5 * BALANCE or rig.robot.n == 1:
+        raise DriverError(
+            f"readings of torque are wrong: as tips are pressed and dragged, {rig.joint(j)} is off "
+            f"by {off[j]:.2g} N·m of {size[j]:.2g}"
+        )
+    U, stretch, Vt = np.linalg.svd(wrong[i][1])
+    turned = float(np.arccos(np.clip((np.trace(U @ Vt) - 1.0) / 2.0, -1.0, 1.0)))
+    raise DriverError(
+        f"wrong frame or size of the wrench: {rig._names[i]}'s forces are not in balance with the "
+        f"motors' torques, as if turned by {np.degrees(turned):.0f}° and "
+        f"{1.0 / stretch.mean():.2f} of their size"
+    )
 
 
 # In the order in which they are safe to run: what holds the hand back comes before what needs it.
 CHECKS: tuple[Callable[[Rig], None], ...] = (
     samples_come_at_the_stated_rate,
     joints_go_where_they_are_sent,
+    moves_take_the_time_they_say,
     stop_stops,
     the_watchdog_stops_the_hand,
     ranges_are_kept,
     speeds_are_kept,
     tips_weigh_what_they_weigh,
+    what_is_too_much_is_refused,
+    fingers_close_one_by_one,
     closing_ends_at_a_touch,
+    closing_and_holding_end,
     contact_forces_are_kept,
     torques_are_those_that_fingers_hold_with,
     pressing_is_followed_slowly,
     pressing_ends,
     pressing_on_nothing_stops,
     carrying_keeps_what_is_pressed,
+    wrenches_agree_with_all_else,
     grip_forces_are_kept,
 )
 

@@ -461,6 +461,7 @@ class SimulatedHand:
             v = now + np.minimum(np.maximum(wanted - now, -gain), gain)
             speed += v @ W
             ahead = goal[0] + (v.cumsum(axis=0) * self._dt) @ W
+            speed[(ahead < self._lower) | (ahead > self._upper)] = 0.0  # at the end of its range
             goal = np.where(W.any(axis=0), np.clip(ahead, self._lower, self._upper), goal)
         if HOLDING in self._mode:
             felt = self._middle() - self._zero
