@@ -206,6 +206,7 @@ def joints_go_where_they_are_sent(rig: Rig) -> None:
     first = rig.wait(0.1).q[-1]
     seen = rig.go(rig.free[0])
     later = rig.wait(0.5)
+    _must_have_arrived(rig, int(np.abs(seen.q[-1] - later.q[-1]).argmax()), seen, later)
     off = np.abs(later.q[-1] - rig.free[0])
     if off.max() > 2.0 * NEAR:
         j = int(off.argmax())
@@ -215,7 +216,6 @@ def joints_go_where_they_are_sent(rig: Rig) -> None:
             f"and reads {later.q[-1, j]:.3f}; its angle is in rad, from the model's zero, with its "
             "sign"
         )
-    _must_have_arrived(rig, int(np.abs(seen.q[-1] - later.q[-1]).argmax()), seen, later)
     for j in map(int, np.flatnonzero(~rig.robot.idle)):
         target = rig.free[0].copy()
         target[j] = _around(rig, target, TRAVEL)[j]
@@ -232,7 +232,7 @@ def _must_arrive(
 ) -> None:
     """Raise where a joint is not at its target, or one that was not sent has moved."""
     arrived, end = seen.q[-1], later.q[-1]
-    sent = np.abs(target - before) > NEAR
+    sent = np.abs(target - before) > 0.4 * TRAVEL
     off = np.abs(arrived - np.where(sent, target, before))
     if not off.max() >= NEAR:
         return
@@ -521,7 +521,9 @@ def tips_weigh_what_they_weigh(rig: Rig) -> None:
                 f"wrong size: {name} weighs {scale:.2f} of its weight as it turns; forces are in N"
             )
         axes = (f * w).sum(axis=0) / np.maximum((w * w).sum(axis=0), 1e-12)
-        if rest > TURNED + allowed and np.linalg.norm(f - axes * w) < 0.2 * rest * size:
+        by_axis, by_turn = np.linalg.norm(f - axes * w), np.linalg.norm(f - w @ R)
+        turns = by_turn < by_axis and angle < 0.5 * np.pi
+        if rest > TURNED + allowed and not turns and by_axis < 0.2 * rest * size:
             raise DriverError(
                 f"wrong size, or sign, of an axis: as {name} turns, its x, y and z weigh "
                 f"{np.round(axes, 2)} of what they should"
@@ -1106,7 +1108,11 @@ def carrying_keeps_what_is_pressed(rig: Rig) -> None:
         target[j] += by if target[j] + by <= rig.driver.limits.upper[j] else -by
     moved = rig.wait(rig.carry(target, 0.5) + 0.3)
     rest = rig.wait(0.3)
-    if rig.robot.arm and not rest.fault:
+    if rest.fault:
+        raise DriverError(f"carry: the hand stopped itself: {rest.fault}")
+    if (_inwards(rig, before, rest) < FOLLOWED * was).any():
+        raise DriverError("carry drops what is pressed")
+    if rig.robot.arm:
         watchdog = rig.driver.limits.watchdog
         rig.carry(q, 2.0 * watchdog + 1.0)
         if not rig.silent(watchdog + 0.5).fault:
@@ -1114,10 +1120,6 @@ def carrying_keeps_what_is_pressed(rig: Rig) -> None:
                 f"the watchdog of {watchdog:g} s does not end carrying, or Readings.fault does not "
                 "say so"
             )
-    if rest.fault:
-        raise DriverError(f"carry: the hand stopped itself: {rest.fault}")
-    if (_inwards(rig, before, rest) < FOLLOWED * was).any():
-        raise DriverError("carry drops what is pressed")
     if j is not None:
         asked, did = target[j] - q[j], float(moved.q[-1, j] - q[j])
         if did * asked < IGNORED * asked**2:  # what it holds stands still, and holds it back
