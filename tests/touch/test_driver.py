@@ -1,6 +1,8 @@
 """The driver's contract: the simulated hand keeps it, and every broken driver is found out."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +23,30 @@ def scene():
 @pytest.fixture(scope="module")
 def grasp(scene):
     return hg.GeometricProbe(scene, "pass").touch(POSTURE)
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """What docs/real-hand.md writes out: the toy hand, and the postures of its rig."""
+    page = (Path(__file__).parents[2] / "docs" / "real-hand.md").read_text(encoding="utf-8")
+    hand, rig, *_ = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    names = {}
+    exec(hand + rig.split("check_driver(Rig(")[0], names)
+    return names
+
+
+@pytest.fixture(params=["toy", "simulated"])
+def rig(request, toy, scene, grasp):
+    """Returns the rig of a driver that is made of a good hand."""
+
+    def make(broken):
+        if request.param == "simulated":
+            return rig_of(broken(hg.SimulatedHand(scene)), scene, grasp)
+        hand = toy["ToyHand"]()
+        hand.robot = toy["robot"]
+        return Rig(broken(hand), toy["robot"], toy["free"], toy["q_open"], toy["normals"])
+
+    return make
 
 
 def rig_of(driver, scene, grasp):
@@ -425,8 +451,262 @@ def test_a_broken_driver_is_refused_by_the_name_of_its_fault(scene, grasp, check
         check(rig_of(broken(hg.SimulatedHand(scene)), scene, grasp))
 
 
-def test_every_check_refuses_something(scene, grasp):
-    assert set(BROKEN) == set(CHECKS)
+class Sold(Broken):
+    """Reads, or does, what `changes` say instead of what a good hand does."""
+
+    def __init__(self, hand, **changes):
+        super().__init__(hand)
+        for name, change in changes.items():
+            setattr(self, name, change.__get__(self))
+
+
+def says(channel, change):
+    """Readings of that channel are changed."""
+    return {"spoil": lambda self, r: replace(r, **{channel: change(getattr(r, channel).copy())})}
+
+
+def exchanged(x, axis, one=-3, other=-2):
+    order = np.arange(x.shape[axis])
+    order[[one, other]] = order[[other, one]]
+    return np.take(x, order, axis)
+
+
+def late(channel, seconds):
+    def spoil(self, readings):
+        x, n = getattr(readings, channel), round(seconds * self.rate)
+        kept = self.__dict__.get("kept", np.repeat(x[:1], n, axis=0))
+        all_of_it = np.concatenate([kept, x])
+        self.kept = all_of_it[-n:]
+        return replace(readings, **{channel: all_of_it[: len(x)]})
+
+    return {"spoil": spoil}
+
+
+def axis_turned(degrees, axis):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    R = np.roll(np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]), (axis, axis), (0, 1))
+    return says("wrench", lambda x: turned(x, R))
+
+
+def moved_by(offset):
+    return says(
+        "wrench", lambda x: np.dstack([x[..., :3], x[..., 3:] + np.cross(offset, x[..., :3])])
+    )
+
+
+def busy(hand):
+    """What the hand is at, of either kind."""
+    if isinstance(hand, hg.SimulatedHand):
+        return {"closing": 1 in hand._mode, "holding": 2 in hand._mode}
+    return {"closing": bool(hand.closing), "holding": bool(hand.holding)}
+
+
+def asleep(what):
+    """A watchdog that sleeps meanwhile."""
+
+    def wait(self, duration):
+        parts = []
+        while busy(self.hand)[what] and duration > 0.5:
+            parts.append(self.hand.wait(0.5))
+            duration -= 0.5
+        return contract._joined([*parts, self.hand.wait(duration)])
+
+    return {"wait": wait}
+
+
+def closes(finger=lambda i: (i,), speed=1.0, force=1.0):
+    def close(self, i, v, f):
+        self.limits.require_hold("close", f)
+        for j in finger(i):
+            self.hand.close(j, speed * v, min(force * f, self.limits.hold))
+
+    return {"close": close}
+
+
+def move_hurries(self, q, duration):
+    self.hand.move(q, 0.3)
+    return duration
+
+
+def newest(self, r):
+    return replace(
+        r, time=r.time[-1:], q=r.q[-1:], velocity=r.velocity[-1:], wrench=r.wrench[-1:],
+        torque=r.torque[-1:],
+    )  # fmt: skip
+
+
+def stop_but(what):
+    return {"stop": lambda self: None if busy(self.hand)[what] else self.hand.stop()}
+
+
+def raises(self, force):
+    raise ZeroDivisionError("of its own")
+
+
+def claims(**changes):
+    return lambda hand: Limitless(hand, **{k: v(hand.limits) for k, v in changes.items()})
+
+
+R1, JOINTS, CLOSE = (
+    contract.samples_come_at_the_stated_rate,
+    contract.joints_go_where_they_are_sent,
+    contract.fingers_close_one_by_one,
+)
+WEIGH, END, MOVE = (
+    contract.tips_weigh_what_they_weigh,
+    contract.closing_and_holding_end,
+    contract.moves_take_the_time_they_say,
+)
+TORQUE, MUCH = (
+    contract.torques_are_those_that_fingers_hold_with,
+    contract.what_is_too_much_is_refused,
+)
+
+# Faults of both hands: the check that finds it, its name, and what it does.
+FAULTS = [
+    (R1, r"readings are missing: .* returns 1 samples", {"spoil": newest}),
+    (R1, "readings are missing", {"wait": lambda self, d: self.hand.wait(0.5 * d)}),
+    (R1, "a sensor does not answer: readings of wrench", says("wrench", lambda x: np.nan * x)),
+    (R1, "Readings.fault says: hm", {"spoil": lambda self, r: replace(r, fault="hm")}),
+    (R1, "move returns None", {"move": lambda self, q, d: self.hand.move(q, d) and None}),
+    (JOINTS, "joints are exchanged", says("q", lambda x: exchanged(x, 1))),
+    (JOINTS, "joints are exchanged", {"move": lambda self, q, d: self.hand.move(exchanged(q, 0), d)}),  # noqa: E501
+    (JOINTS, r"and reads .* its angle is in rad", says("q", np.degrees)),
+    (JOINTS, "a joint does not arrive", says("q", lambda x: x + 0.05)),
+    (JOINTS, "velocity are wrong.* says [+-]0.000", says("velocity", lambda x: 0.0 * x)),
+    (JOINTS, "velocity are wrong.* says -0.100", says("velocity", lambda x: -x)),
+    (JOINTS, "velocity are wrong.* says [+]0.200", says("velocity", lambda x: 2.0 * x)),
+    (JOINTS, "velocity are wrong", says("velocity", lambda x: exchanged(x, 1))),
+    (JOINTS, "stale: .* velocity is .0.05. s behind", late("velocity", 0.05)),
+    (JOINTS, "stale: .* velocity is -0.0", late("q", 0.05)),
+    (MOVE, "move ignores its duration: it returns 0.3", {"move": lambda self, q, d: self.hand.move(q, 0.3)}),  # noqa: E501
+    (MOVE, "ignores its duration|takes longer than it says", {"move": move_hurries}),
+    (MOVE, "no limit is in the way", {"move": lambda self, q, d: 2.0 * self.hand.move(q, d)}),
+    (contract.ranges_are_kept, "beyond its range", claims(upper=lambda m: m.upper - 0.05)),
+    (contract.ranges_are_kept, "beyond its range", claims(upper=lambda m: m.upper - 0.5)),
+    (contract.speeds_are_kept, "limits not held: .* rad/s", claims(speed=lambda m: 0.5 * m.speed)),
+    (WEIGH, "wrong size: .* weighs 2.00", says("wrench", lambda x: 2.0 * x)),
+    (WEIGH, "a dead sensor: .* weighs 0.00", says("wrench", lambda x: 0.0 * x)),
+    (WEIGH, "wrong size: finger_1 weighs 0.50", says("wrench", lambda x: 0.5 * x)),
+    (WEIGH, "wrong frame: .* is 15° off", axis_turned(15, 0)),
+    (WEIGH, "wrong frame: .* is 15° off", axis_turned(15, 1)),
+    (WEIGH, "wrong frame: .* is 15° off", axis_turned(15, 2)),
+    (WEIGH, "size, or sign, of an axis", says("wrench", lambda x: x * [0, 1, 1, 1, 1, 1])),
+    (WEIGH, "wrong point: .* 2.0 mm off", moved_by([2e-3, 0.0, 0.0])),
+    (WEIGH, "wrong point: .* 2.0 mm off", moved_by([0.0, 0.0, 2e-3])),
+    (MUCH, "hold: .* is not refused", {"hold": lambda self, f: self.hand.hold(min(f, self.limits.hold))}),  # noqa: E501
+    (MUCH, "hold raises ZeroDivisionError: of its own", {"hold": raises}),
+    (CLOSE, "wrenches are exchanged", says("wrench", lambda x: exchanged(x, 1))),
+    (CLOSE, "flags are exchanged", says("touched", lambda x: exchanged(x, 0))),
+    (CLOSE, "is said to have stalled", says("stalled", lambda x: ~x)),
+    (CLOSE, "said to have touched before it moved", says("touched", lambda x: x | True)),
+    (CLOSE, "finger_2 moved in its place", closes(lambda i: ((i + 1) % 3,))),
+    (CLOSE, "finger_2, finger_3 moved with it", closes(lambda i: range(3))),
+    (CLOSE, "close ignores its speed: .* closed at 0.6", closes(speed=2.0)),
+    (CLOSE, "close ignores its speed: .* closed at 0.9", closes(speed=3.0)),
+    (CLOSE, "was asked for 1 N and reads (2|1.99)", closes(force=2.0)),
+    (CLOSE, "asked for 1 N and reads|to end at 1 N, did not", closes(force=5.0)),
+    (CLOSE, "asked for 1 N and reads|to end at 1 N, did not", closes(force=8.0)),
+    (CLOSE, "hold: .* was asked for 2 N", {"hold": lambda self, f: None}),
+    (CLOSE, "wrench are stale: .* 0.04 s later", late("wrench", 0.05)),
+    (CLOSE, "wrench are stale: .* 0.29 s later", late("wrench", 0.3)),
+    (TORQUE, "readings of torque are wrong", says("torque", lambda x: 0.5 * x)),
+    (TORQUE, "readings of torque are wrong", says("torque", lambda x: exchanged(x, 1, -4, -1))),
+    (TORQUE, "the motors' torque is 0.05 s behind", late("torque", 0.05)),
+    (END, "watchdog of 1 s does not end closing", asleep("closing")),
+    (END, "watchdog of 1 s does not end holding", asleep("holding")),
+    (END, "stop does not end closing", stop_but("closing")),
+    (END, "stop does not end holding", stop_but("holding")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("check", "name", "fault"), FAULTS)
+def test_a_fault_of_either_hand_is_refused_by_its_name(rig, check, name, fault):
+    broken = fault if callable(fault) else lambda hand: Sold(hand, **fault)
+    with pytest.raises(DriverError, match=name):
+        check(rig(broken))
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"), [("is 0", 0.0), ("torque is halved", 0.5), ("torque is doubled", 2.0)]
+)
+def test_a_wrong_torque_of_the_wrench_shows_as_tips_are_dragged(scene, grasp, name, scale):
+    fault = says("wrench", lambda x: x * np.repeat([1.0, scale], 3))
+    with pytest.raises(DriverError, match=f"wrong torque of the wrench: .*{name}"):
+        contract.wrenches_agree_with_all_else(
+            rig_of(Sold(hg.SimulatedHand(scene), **fault), scene, grasp)
+        )
+
+
+def test_a_watchdog_that_sleeps_while_the_arm_carries_is_found(scene, grasp):
+    class Carrier(Broken):
+        def wait(self, duration):
+            while self.hand._ramp and self.hand._asked is not None and duration > 0.5:
+                self.hand.wait(0.5)
+                duration -= 0.5
+            return self.hand.wait(duration)
+
+    with pytest.raises(DriverError, match="does not end carrying"):
+        contract.carrying_keeps_what_is_pressed(
+            rig_of(Carrier(hg.SimulatedHand(scene)), scene, grasp)
+        )
+
+
+def test_what_a_move_only_hides_is_found(toy):
+    """The toy's move sets its path, and forgets that fingers close."""
+
+    def move(self, q, duration):
+        closing = dict(self.hand.closing)
+        duration = self.hand.move(q, duration)
+        self.hand.closing = closing
+        return duration
+
+    rig = Rig(
+        Sold(toy["ToyHand"](), move=move), toy["robot"], toy["free"], toy["q_open"], toy["normals"]
+    )
+    with pytest.raises(DriverError, match="move does not end closing"):
+        END(rig)
+
+
+def test_normals_that_are_known_to_ten_degrees_are_enough(scene, grasp):
+    physics = hg.Physics(imperfections=hg.Imperfections.preset("loadcell"))
+    good = rig_of(hg.SimulatedHand(scene, physics), scene, grasp)
+    across = np.cross(good.normals, [0.3, -0.5, 0.8])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    off = np.cos(np.radians(9.0)) * good.normals + np.sin(np.radians(9.0)) * across
+    rig = Rig(good.driver, good.robot, good.free, good.open, off)
+    contract.closing_ends_at_a_touch(rig)
+    contract.wrenches_agree_with_all_else(rig)
+
+
+def test_a_channel_spoilt_at_random_is_refused(scene, grasp):
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        channel = str(rng.choice(["q", "velocity", "wrench", "torque"]))
+        how = rng.choice(["scaled", "late", "exchanged"])
+        one, other = rng.choice(3, 2, replace=False) - 3  # fingers, or their joints
+        if how == "late":
+            fault = late(channel, float(rng.uniform(0.05, 0.3)))
+        elif how == "scaled":
+            by = np.ones(3 if channel == "wrench" else 11)
+            by[one] = rng.choice([-1.0, 0.0, 0.5, 2.0])
+            by = by[:, None] if channel == "wrench" else by
+            fault = says(channel, lambda x, by=by: x * by)
+        else:
+            fault = says(channel, lambda x, one=one, other=other: exchanged(x, 1, one, other))
+        rig = rig_of(Sold(hg.SimulatedHand(scene), **fault), scene, grasp)
+        with pytest.raises(DriverError):
+            until_refused(rig)
+
+
+def until_refused(rig):
+    for check in CHECKS:
+        check(rig)
+
+
+def test_every_check_refuses_something():
+    found = set(BROKEN) | {check for check, *_ in FAULTS}
+    assert found | {contract.wrenches_agree_with_all_else} == set(CHECKS)
 
 
 def test_all_that_is_broken_is_told_at_once_and_a_refusal_is_no_way_out(scene, grasp):
