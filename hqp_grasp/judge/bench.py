@@ -16,7 +16,7 @@ from hqp_grasp.world.scene import Scene
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
-NOSLIP = 2  # iterations after each step that keep edges from creeping
+NOSLIP = 2  # iterations after each step that keep edges from creeping, as DexGraspBench has them
 DEEPEST = 1e-3  # [m] that a grasp to be tested may have a link in the object
 PRESSED = 1e-3  # [N] below which a contact counts as none
 
