@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pyarrow as pa
@@ -219,7 +220,11 @@ def test_the_command_picks_and_says_what_came_of_it(tmp_path):
     assert "lifted   1 of 1" in ran.stdout and kinds(table) == {}
     assert table["felt_weight"][0].as_py() == pytest.approx(0.3, rel=0.03)
     assert (tmp_path / "there" / "pick.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "there" / "replay.html").stat().st_size > 1e5
+    replay = tmp_path / "there" / "replay.html"
+    if find_spec("viser"):
+        assert replay.stat().st_size > 1e5
+    else:
+        assert not replay.exists() and "replay   none: " in ran.stdout and "viser" in ran.stdout
 
 
 @pytest.mark.parametrize(
