@@ -18,6 +18,7 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
 NOSLIP = 2  # iterations after each step that keep edges from creeping, as DexGraspBench has them
 DEEPEST = 1e-3  # [m] that a grasp to be tested may have a link in the object
+CARRIED = 1 << 30  # collision bit of the object and what it stands on, of nothing else
 PRESSED = 1e-3  # [N] below which a contact counts as none
 
 
@@ -72,6 +73,10 @@ class Bench:
         }
         self._tips = [{model.geom(robot.model.geom(g).name).id for g in gs} for gs in robot.geoms]
         self._support = model.geom(SUPPORT).id
+        things = sorted(self._things)
+        for bits in (model.geom_contype, model.geom_conaffinity):
+            bits[self._support] = CARRIED  # it carries the object, and hands reach past it
+            bits[things] |= CARRIED
         self._pose = palm_sensors(model)
         data.ctrl[self._servo] = self.told[driven]
         mujoco.mj_forward(model, data)
@@ -83,8 +88,8 @@ class Bench:
     def _refuse_overlap(self) -> None:
         for contact in self.data.contact[: self.data.ncon]:
             one, other = contact.geom.tolist()
-            links = {one, other} - self._things - {self._support}
-            if len(links) == 1 and contact.dist < -DEEPEST:
+            links = {one, other} - self._things
+            if len(links) == 1 and self._support not in links and contact.dist < -DEEPEST:
                 raise InputError(
                     f"{self.model.geom(links.pop()).name} is {-1e3 * contact.dist:.1f} mm in the "
                     "object: a grasp is judged from where its contacts touch"

@@ -2,6 +2,7 @@
 
 import multiprocessing
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -128,6 +129,17 @@ def test_a_link_in_the_object_is_refused_before_anything_moves(scene, grasp):
     inside = robot.grasp(q, grasp.contacts)
     with pytest.raises(InputError, match=r"tip is .* mm in the object"):
         Judge(scene, five_newton).judge(inside)
+
+
+def test_a_finger_below_the_object_is_not_stopped_by_what_it_stands_on(scene, grasp):
+    """A fixed object has nothing below it: hands may have reached there."""
+    bench = Bench(scene, grasp, Physics(support="pedestal"))
+    model, data = bench.model, bench.data
+    support = model.geom("support").id
+    model.geom_pos[support] = data.xpos[model.body("f1_distal").id]  # where a finger is
+    mujoco.mj_forward(model, data)
+    pairs = [set(contact.geom.tolist()) for contact in data.contact[: data.ncon]]
+    assert all(pair - {support} <= bench._things for pair in pairs if support in pair)
 
 
 @pytest.mark.parametrize("name", ["mass", "friction", "lift", "slip", "rate", "timestep"])
