@@ -89,7 +89,7 @@ mutants: $(READY_DEV)
 RESULTS := out/results
 keep = $(PY) $(2) > $(RESULTS)/$(1).txt
 define judged
-$(PY) scenarios/$(1).py --trials 40 --probes 20 --seed 83 --out $(RESULTS)/judged-$(1) > $(RESULTS)/judged-$(1).txt
+$(PY) scenarios/$(1).py --trials 100 --probes 20 --seed 83 --out $(RESULTS)/judged-$(1) > $(RESULTS)/judged-$(1).txt
 $(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --protocol pulls dexgraspbench >> $(RESULTS)/judged-$(1).txt
 $(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --force 10 --mass 0.5 >> $(RESULTS)/judged-$(1).txt
 $(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --force 1 --protocol dexgraspbench >> $(RESULTS)/judged-$(1).txt
