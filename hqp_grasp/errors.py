@@ -69,6 +69,14 @@ def _number(name: str, value: object, wanted: str) -> float:
     return float(value)
 
 
+def finite(name: str, value: object) -> float:
+    """Return `value` as a finite float, else raise InputError."""
+    found = number(name, value)
+    if not math.isfinite(found):
+        raise InputError(f"{name} must be finite; got {found}")
+    return found
+
+
 def positive(name: str, value: object) -> float:
     """Return `value` as a finite float above zero, else raise InputError."""
     found = _number(name, value, "a number above 0")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from hqp_grasp.errors import InputError, instance, number, positive
+from hqp_grasp.errors import InputError, finite, instance, positive
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
 from hqp_grasp.touch.driver import Driver, Readings, require_touch
 from hqp_grasp.touch.geometric import RETREAT
@@ -69,7 +69,7 @@ class PhysicalProbe:
         require_touch("PhysicalProbe.driver", self.driver)
         object.__setattr__(self, "force", positive("PhysicalProbe.force", self.force))
         if self.table is not None:
-            object.__setattr__(self, "table", number("PhysicalProbe.table", self.table))
+            object.__setattr__(self, "table", finite("PhysicalProbe.table", self.table))
         self.driver.limits.require_hold("PhysicalProbe.force", self.force)
         if len(self.driver.limits.lower) != self.robot.n:
             raise InputError(

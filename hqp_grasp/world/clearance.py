@@ -42,7 +42,7 @@ class SelfClearance:
         pairs = _pairs(robot)
         data = mujoco.MjData(model)
         robot.place(data, robot.home)
-        far = 2.0 * self.least + TOUCHES
+        far = 2.0 * self.least
         home = np.full(len(pairs), far)
         for i in np.flatnonzero(_bound(model, data, pairs) < far):
             home[i] = mujoco.mj_geomDistance(model, data, *map(int, pairs[i]), far, None)
@@ -80,8 +80,7 @@ class SelfClearance:
 
     def collisions(self, q: np.ndarray) -> tuple[tuple[str, str], ...]:
         """The pairs that overlap at q (n,)."""
-        near = self.near(q, 10.0 * TOUCHES)
-        return tuple(n for n, d in zip(near.names, near.distance, strict=True) if d < -TOUCHES)
+        return self.near(q, 0.0).names
 
 
 def _pairs(robot: Robot) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, not_negative, number, one_of, whole
+from hqp_grasp.errors import InputError, finite, not_negative, number, one_of, whole
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,11 @@ class Fault:
     def __post_init__(self) -> None:
         one_of("fault", self.kind, FAULTS)
         object.__setattr__(self, "finger", whole("Fault.finger", self.finger, 0))
-        object.__setattr__(self, "begin", number("Fault.begin", self.begin))
-        object.__setattr__(self, "duration", number("Fault.duration", self.duration))
+        object.__setattr__(self, "begin", finite("Fault.begin", self.begin))
+        duration = number("Fault.duration", self.duration)
+        if not duration > 0.0:
+            raise InputError(f"Fault.duration must be above 0, or inf; got {duration}")
+        object.__setattr__(self, "duration", duration)
 
 
 FAULTS = {
@@ -62,7 +65,7 @@ class Imperfections:
 
     def __post_init__(self) -> None:
         for at in fields(self)[:-1]:
-            least = number if at.name == "gravity_error" else not_negative
+            least = finite if at.name == "gravity_error" else not_negative
             value = least(f"Imperfections.{at.name}", getattr(self, at.name))
             object.__setattr__(self, at.name, value)
         if not isinstance(self.faults, tuple) or not all(isinstance(f, Fault) for f in self.faults):

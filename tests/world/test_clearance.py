@@ -1,0 +1,162 @@
+"""Links of one robot that come near one another: which pairs, how near, and how that changes."""
+
+import itertools
+
+import numpy as np
+import pytest
+from tiny_hand import change
+
+from hqp_grasp.world.clearance import SelfClearance
+from hqp_grasp.world.description import RobotDescription
+from hqp_grasp.world.robot import Robot, compiled
+
+STEP = 1e-6  # [rad, m]
+# Two arms on a base: a slide with a hinge, and a hinge with its follower. A post stands beside.
+XML = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <geom name="floor" type="box" size="1 1 0.01" pos="0 0 -0.5"/>
+    <body name="post" pos="0.2 0 0"><geom name="post" type="box" size="0.05 0.05 0.4"/></body>
+    <body name="base">
+      <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+      <joint name="yaw" axis="0 0 1" range="-3 3"/>
+      <geom name="base" type="sphere" size="0.04"/>
+      <body name="left" pos="-0.1 0 0.1">
+        <joint name="slide" type="slide" axis="1 0 0" range="-0.2 0.2"/>
+        <geom name="left" type="sphere" size="0.02"/>
+        <body name="paddle" pos="0 0 0.2">
+          <joint name="turn" axis="0 1 0" range="-2 2"/>
+          <geom name="paddle" type="capsule" fromto="0 0 0 0.04 0.01 -0.02" size="0.01"/>
+        </body>
+      </body>
+      <body name="right" pos="0.1 0 0.1">
+        <joint name="swing" axis="0 1 0" range="-2 2"/>
+        <geom name="right" type="sphere" size="0.03"/>
+        <geom name="drawn" type="sphere" size="0.5" contype="0" conaffinity="0"/>
+        <body name="ball" pos="0.1 0 0.2">
+          <joint name="follow" axis="0 1 0" range="-2 2"/>
+          <geom name="ball" type="sphere" size="0.02" pos="-0.05 0 0"/>
+          <body name="welded">
+            <geom name="welded" type="sphere" size="0.01" pos="-0.05 0 0.03"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="follow" joint2="swing" polycoef="0 -0.5 0 0 0"/></equality>
+</mujoco>"""
+TOML = 'model = "arms.xml"\n{more}\n[[contact_points]]\nlink = "paddle"\nflexion = ["turn"]\n'
+
+
+def robot(folder, xml=XML, more=""):
+    (folder / "arms.xml").write_text(xml)
+    (folder / "robot.toml").write_text(TOML.format(more=more))
+    about = RobotDescription.load(folder)
+    return Robot(about, compiled(about))
+
+
+def pairs(links):
+    model = links.robot.model
+    return {frozenset(model.geom(int(g)).name for g in pair) for pair in links.pairs}
+
+
+def both(text):
+    return {frozenset(pair.split("-")) for pair in text.split()}
+
+
+MOVING = "left-right left-ball left-welded paddle-right paddle-ball paddle-welded base-paddle"
+ALL = MOVING + " base-ball base-welded"
+
+
+def test_pairs_are_those_that_collide_and_move_against_one_another(tmp_path):
+    """Not of one link, nor of neighbours, nor of what stands by itself or is only drawn."""
+    assert pairs(SelfClearance(robot(tmp_path), 0.005)) == both(ALL)
+    quiet = change(
+        XML, '"0.02" pos="-0.05 0 0"', '"0.02" pos="-0.05 0 0" contype="0" conaffinity="2"'
+    )
+    assert pairs(SelfClearance(robot(tmp_path, quiet), 0.005)) == both(ALL)
+
+
+@pytest.mark.parametrize("order", ["left right", "right left"])
+def test_what_the_model_excludes_is_no_pair_in_either_order(tmp_path, order):
+    one, other = order.split()
+    out = f'<contact><exclude body1="{one}" body2="{other}"/></contact></mujoco>'
+    links = SelfClearance(robot(tmp_path, change(XML, "</mujoco>", out)), 0.005)
+    assert pairs(links) == both(ALL) - both("left-right")
+
+
+def test_distances_are_those_of_the_shapes_and_pairs_beyond_are_left_out(tmp_path):
+    arms = robot(tmp_path)
+    links, q = SelfClearance(arms, 0.005), np.array([0.7, 0.05, 0.3, -0.2])
+    data = arms._at(q)
+    at = {name: data.geom(name).xpos for name in ("left", "right", "ball", "welded")}
+    radius = {"left": 0.02, "right": 0.03, "ball": 0.02, "welded": 0.01}
+    for within in (0.5, 0.15, 0.05):
+        near = links.near(q, within)
+        assert (near.distance < within).all()
+        found = dict(zip(map(frozenset, near.names), near.distance, strict=True))
+        for one, other in itertools.combinations(radius, 2):
+            pair = frozenset((one, other))
+            if pair not in pairs(links):
+                continue
+            gap = np.linalg.norm(at[one] - at[other]) - radius[one] - radius[other]
+            assert (pair in found) == (gap < within)
+            assert found.get(pair, gap) == pytest.approx(gap, abs=1e-9)
+    assert links.near(q, -1.0).jacobian.shape == (0, 4)
+
+
+# The ball of the right arm is pushed into the left arm, beside it, and the other way round.
+POSTURES = {
+    "apart": [0.7, 0.05, 0.3, -0.2],
+    "near": [-1.1, 0.09, -0.4, 0.1],
+    "overlapping": [0.4, 0.16, 0.2, -0.1],
+    "deep": [0.4, 0.175, -0.6, 0.05],
+}
+
+
+@pytest.mark.parametrize("posture", POSTURES)
+def test_gradients_are_the_rates_of_the_distances_also_where_links_overlap(tmp_path, posture):
+    links, q = SelfClearance(robot(tmp_path), 0.005), np.array(POSTURES[posture])
+    near = links.near(q, 0.4)
+    assert (near.distance < 0.0).any() == (posture in ("overlapping", "deep"))
+    assert len(near.names) == len(pairs(links))
+    rates = [
+        (links.near(q + d, 0.4).distance - links.near(q - d, 0.4).distance) / (2.0 * STEP)
+        for d in STEP * np.eye(4)
+    ]
+    np.testing.assert_allclose(near.jacobian, np.transpose(rates), atol=1e-6)
+    assert np.abs(near.jacobian[:, 1:]).max(axis=0).min() > 1e-2
+    np.testing.assert_allclose(near.jacobian[:, 0], 0.0, atol=1e-9)  # yaw carries both arms
+
+
+def test_links_keep_what_is_asked_and_half_of_what_they_have_where_home_has_less(tmp_path):
+    arms = robot(tmp_path, more="home = { slide = 0.146 }")
+    links = SelfClearance(arms, 0.005)
+    assert links.at_home == ()
+    near = links.near(arms.home, 1.0)
+    kept = dict(zip(map(frozenset, near.names), near.least, strict=True))
+    (close,) = both("left-right")
+    gap = dict(zip(map(frozenset, near.names), near.distance, strict=True))[close]
+    assert gap == pytest.approx(0.004, abs=1e-9)
+    assert kept.pop(close) == pytest.approx(0.002, abs=1e-9)
+    assert set(kept.values()) == {0.005}
+    wider = SelfClearance(arms, 0.003).near(arms.home, 1.0)
+    assert dict(zip(map(frozenset, wider.names), wider.least, strict=True))[close] == (
+        pytest.approx(0.002, abs=1e-9)
+    )
+    least = SelfClearance(arms, 0.0015).near(arms.home, 1.0).least
+    np.testing.assert_allclose(least, 0.0015)
+
+
+@pytest.mark.parametrize(("slide", "touches"), [(0.1502, True), (0.15 - 1e-5, False)])
+def test_pairs_that_touch_at_home_are_let_be(tmp_path, slide, touches):
+    links = SelfClearance(robot(tmp_path, more=f"home = {{ slide = {slide} }}"), 0.005)
+    assert links.at_home == ((("left", "right"),) if touches else ())
+    assert pairs(links) == both(ALL) - (both("left-right") if touches else set())
+
+
+def test_collisions_are_the_pairs_that_overlap(tmp_path):
+    links = SelfClearance(robot(tmp_path), 0.005)
+    for slide, names in ((0.15 - 2e-6, ()), (0.15 + 2e-6, (("left", "right"),))):
+        assert links.collisions(np.array([0.3, slide, 0.0, 0.0])) == names
