@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -97,15 +98,14 @@ def _pairs(robot: Robot) -> np.ndarray:
         if model.geom_bodyid[g] and model.body_rootid[model.geom_bodyid[g]] in roots
     ]
     pairs = []
-    for i, one in enumerate(own):
-        for other in own[i + 1 :]:
-            a, b = int(model.geom_bodyid[one]), int(model.geom_bodyid[other])
-            u, v = int(weld[a]), int(weld[b])
-            if u == v or above[a] == v or above[b] == u:
-                continue
-            if (a << 16) + b in excluded or (b << 16) + a in excluded:
-                continue
-            pairs.append((one, other))
+    for one, other in combinations(own, 2):
+        a, b = int(model.geom_bodyid[one]), int(model.geom_bodyid[other])
+        u, v = int(weld[a]), int(weld[b])
+        if u == v or above[a] == v or above[b] == u:
+            continue
+        if (a << 16) + b in excluded or (b << 16) + a in excluded:
+            continue
+        pairs.append((one, other))
     return np.reshape(pairs, (-1, 2)).astype(int)
 
 

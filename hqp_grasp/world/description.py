@@ -873,7 +873,7 @@ def _couple(spec: mujoco.MjSpec, joint: str, to: str, rest: float, ratio: float)
 def nearest(name: str, known: object) -> str:
     """The hint that names the nearest valid name, or all of them."""
     names = [n for n in map(str, known) if n]  # type: ignore[call-overload]
-    near = difflib.get_close_matches(name, names, 1)
+    near = difflib.get_close_matches(name, names)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"{hint}they are: {', '.join(names) or 'none'}"
 
@@ -890,7 +890,7 @@ def _check(data: object, valid: tuple[str, ...], where: str = "") -> None:
         raise InputError(f"{where or 'a description'} must be a table; got {data!r}")
     for key in data:
         if key not in valid:
-            near = difflib.get_close_matches(key, valid, 1)
+            near = difflib.get_close_matches(key, valid)
             hint = f"did you mean {near[0]!r}? Entries" if near else "entries"
             raise ModelError(f"unknown entry {key!r}; {hint} are: {', '.join(valid)}")
 

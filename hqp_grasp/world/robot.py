@@ -348,7 +348,7 @@ class Robot:
         if data is None:
             data = self._local.data = mujoco.MjData(self.model)
             self._local.q = None
-        if self._local.q is None or not np.array_equal(self._local.q, q):
+        if not np.array_equal(self._local.q, q):
             self.place(data, q)
             self._local.q = np.array(q)
         return data
