@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pinocchio as pin
 import pytest
 import tiny_hand
 from tiny_hand import XML, change
@@ -1242,3 +1243,249 @@ def test_pairs_that_touch_at_home_are_let_be_and_others_are_watched(tmp_path):
     closed = "[home]\nleft_joint = 0.6\nright_joint = 0.6"
     links = SelfClearance(robot_of(claw(tmp_path, toml=closed)), 0.005)
     assert links.at_home == (("left:0", "right:0"),)
+
+
+# ---------------------------------------------------------------- of joined files, and frames
+
+
+def as_degrees(xml):
+    """The same model, its angles in degrees."""
+    xml = change(xml, 'angle="radian"', 'angle="degree"')
+    low, high = np.degrees([-0.1, 0.8])
+    xml = change(xml, 'range="-0.1 0.8"', f'range="{low:.15g} {high:.15g}"')
+    return change(xml, 'range="0 3"', f'range="0 {np.degrees(3):.15g}"')
+
+
+@pytest.mark.parametrize("first", ["radian", "degree"])
+@pytest.mark.parametrize("second", ["radian", "degree"])
+def test_each_joined_file_keeps_its_own_unit_of_angles(tmp_path, first, second):
+    """Ranges of the files and of the description, locks and couplings are all radians."""
+    for name, unit in (("first", first), ("second", second)):
+        xml = XML[: XML.index("  <equality>")] + "</mujoco>"
+        (tmp_path / f"{name}.xml").write_text(as_degrees(xml) if unit == "degree" else xml)
+    toml = """
+        couplings = [{ joint = "b_distal", to = "b_proximal", ratio = 0.5, offset = 0.1 }]
+        lock = ["distal"]
+        home = { distal = 0.3 }
+        {ranges}
+        [[model]]
+        file = "first.xml"
+        [[model]]
+        file = "second.xml"
+        prefix = "b_"
+        at = "palm"
+        [[contact_points]]
+        link = "b_distal"
+        flexion = ["b_proximal"]
+    """
+    robots = []
+    for ranges in ("", "ranges = { b_lift = [-0.1, 0.2], b_distal = [-0.05, 0.9] }"):
+        (tmp_path / "two.toml").write_text(toml.replace("{ranges}", ranges))
+        robots.append(robot_of(tmp_path / "two.toml"))
+    plain, changed = robots
+    assert plain.joints == ("lift", "proximal", "b_lift", "b_proximal")
+    np.testing.assert_allclose(plain.lower, [-0.5, 0, -0.1, -0.5, 0, -0.1], atol=1e-9)
+    np.testing.assert_allclose(plain.upper, [0.5, 3, 0.8, 0.5, 3, 0.8], atol=1e-9)
+    np.testing.assert_allclose(changed.lower, [-0.5, 0, -0.1, -0.1, 0, -0.05], atol=1e-9)
+    np.testing.assert_allclose(changed.upper, [0.5, 3, 0.8, 0.2, 3, 0.9], atol=1e-9)
+    np.testing.assert_allclose(plain.offset, [0, 0, 0.3, 0, 0, 0.1], atol=1e-9)
+    np.testing.assert_allclose(plain.q_upper, [0.5, 3, 0.5, 1.4], atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", ["radian", "degree"])
+def test_a_lock_without_home_holds_a_joined_files_joint_where_the_file_puts_it(tmp_path, unit):
+    ref = np.degrees(0.5) if unit == "degree" else 0.5
+    xml = change(
+        XML[: XML.index("  <equality>")] + "</mujoco>", 'range="0 3"', f'ref="{ref}" range="0 3"'
+    )
+    tiny_hand.write(tmp_path)
+    (tmp_path / "second.xml").write_text(as_degrees(xml) if unit == "degree" else xml)
+    toml = """
+        lock = ["b_proximal", "b_lift"]
+        [[model]]
+        file = "tiny.xml"
+        [[model]]
+        file = "second.xml"
+        prefix = "b_"
+        [[contact_points]]
+        link = "b_distal"
+    """
+    (tmp_path / "two.toml").write_text(toml)
+    robot = robot_of(tmp_path / "two.toml")
+    assert robot.joints == ("lift", "proximal", "b_distal")
+    np.testing.assert_allclose(robot.offset[3:5], [0.0, 0.5], atol=1e-9)
+
+
+def test_a_joined_file_stands_in_its_bodys_frame_turned_as_said(tmp_path):
+    tiny_hand.write(tmp_path)
+    for turn in ("quat = [2, 0, 2, 0]", "rpy = [0.0, 1.5707963267948966, 0.0]"):
+        toml = f"""
+            [[model]]
+            file = "tiny.xml"
+            [[model]]
+            file = "tiny.xml"
+            prefix = "b_"
+            at = "distal"
+            pos = [0.1, 0.2, 0.3]
+            {turn}
+            [[contact_points]]
+            link = "b_distal"
+            flexion = ["b_proximal"]
+        """
+        (tmp_path / "two.toml").write_text(toml)
+        robot = robot_of(tmp_path / "two.toml")
+        q = np.array([0.1, 0.4, 0.05, 0.0])
+        # Its x points down then, its z along the x of the first's last link.
+        bend = 1.5 * 0.4
+        ahead, aside = (
+            np.array([np.cos(bend), np.sin(bend), 0]),
+            np.array([-np.sin(bend), np.cos(bend), 0]),
+        )
+        at = 0.06 * np.array([np.cos(0.4), np.sin(0.4), 0]) + 0.1 * ahead + 0.2 * aside
+        tip = at + 0.05 * ahead + np.array([0, 0, 0.1 + 0.3 - 0.1])
+        np.testing.assert_allclose(robot.centers(q), [tip], atol=1e-9)
+
+
+def test_angles_given_as_rpy_turn_about_fixed_axes_x_first(tmp_path):
+    tiny_hand.write(tmp_path)
+    toml = """
+        [[model]]
+        file = "tiny.xml"
+        [[model]]
+        file = "tiny.xml"
+        prefix = "b_"
+        rpy = [0.3, -0.5, 0.9]
+        [[contact_points]]
+        link = "b_distal"
+        flexion = ["b_proximal"]
+    """
+    (tmp_path / "two.toml").write_text(toml)
+    robot = robot_of(tmp_path / "two.toml")
+    R = pin.rpy.rpyToMatrix(0.3, -0.5, 0.9)
+    np.testing.assert_allclose(robot.centers(np.zeros(4)), [R @ [0.1, 0, 0]], atol=1e-9)
+
+
+def test_of_a_file_with_several_roots_the_keyframe_is_read_by_joint(tmp_path):
+    """Also where what is left out has a ball joint and comes first."""
+    other = (
+        '<worldbody><geom size="1"/><body name="ball" pos="1 0 0"><joint name="round" type="ball"/>'
+        '<geom size="0.1"/></body>'
+    )
+    xml = change(change(XML, "<worldbody>", other), 'qpos="0', 'qpos="1 0 0 0 0.4')
+    tiny_hand.write(tmp_path, xml)
+    toml = '[[model]]\nfile = "tiny.xml"\nroot = "palm"\n[[contact_points]]\nlink = "distal"\n'
+    (tmp_path / "robot.toml").write_text(toml)
+    about = RobotDescription.load(tmp_path)
+    assert about.home == {"lift": 0.4, "proximal": 0.2, "distal": 0.1}
+    robot = robot_of(tmp_path)
+    np.testing.assert_array_equal(robot.home, [0.4, 0.2])
+    assert robot.model.nbody == 4 and robot.model.ngeom == 1
+
+
+def test_equalities_are_told_by_name_or_joint_with_whether_they_stay(tmp_path):
+    more = '<equality>\n<joint joint1="lift" joint2="proximal" polycoef="0 0.1 0 0 0"/>'
+    tiny_hand.write(tmp_path, change(XML, "<equality>", more), SHORT)
+    assert RobotDescription.load(tmp_path).equalities == {"follow": True, "lift": True}
+    tiny_hand.write(
+        tmp_path, change(XML, "<equality>", more), 'drop_couplings = ["lift"]\n' + SHORT
+    )
+    assert RobotDescription.load(tmp_path).equalities == {"follow": True, "lift": False}
+    tiny_hand.write(tmp_path, change(XML, "<equality>", more), "drop_couplings = true\n" + SHORT)
+    assert RobotDescription.load(tmp_path).equalities == {"follow": False, "lift": False}
+
+
+def test_a_carriage_carries_no_geoms_of_the_world(tmp_path):
+    tiny_hand.write(tmp_path, change(XML, "<worldbody>", '<worldbody><geom size="1"/>'))
+    palm = 'carriage = true\npalm = { body = "palm" }\nlock = ["lift"]\nworkspace = [0, 0, 0]\n'
+    (tmp_path / "robot.toml").write_text(palm + SHORT)
+    with pytest.raises(ModelError, match="'palm' and geoms of the world"):
+        robot_of(tmp_path)
+
+
+def test_starts_are_degrees_but_for_lengths_and_shares(tmp_path):
+    angles = "adduction = [10, 20], elevation = [-5, 5]"
+    start = f"start = {{ {angles}, offset = [-0.01, 0.02], joints = 0.1 }}"
+    about = RobotDescription.load(tiny_hand.write(tmp_path, toml=f"{start}\n{SHORT}"))
+    assert about.start["adduction"] == pytest.approx(np.radians([10, 20]))
+    assert about.start["elevation"] == pytest.approx(np.radians([-5, 5]))
+    assert about.start["offset"] == (-0.01, 0.02) and about.start["joints"] == 0.1
+
+
+def test_speed_is_that_of_a_quarter_meter_or_a_radian_a_second_unless_said(tmp_path):
+    for line, speeds in (("", [0.25, 1.0]), ("speed = 0.7", [0.7, 0.7])):
+        np.testing.assert_array_equal(written(tmp_path, toml=f"{line}\n{SHORT}").velocity, speeds)
+    assert RobotDescription.load(tmp_path).clearance == 0.005
+
+
+# ---------------------------------------------------------------- palms that are found
+
+
+def three(folder, turn=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), depth=0.1, more=""):
+    """Three fingers around a turned base, or two against one, that point along its z axis."""
+    fingers = ""
+    for i, angle in enumerate((0.0, 2.3, 4.1)):
+        x, y = 0.06 * np.cos(angle), 0.06 * np.sin(angle)
+        fingers += (
+            f'<body name="f{i}" pos="{x} {y} 0"><joint name="j{i}" axis="{-np.sin(angle)} '
+            f'{np.cos(angle)} 0" range="-1.2 0.1"/><geom type="sphere" size="0.01" '
+            f'pos="0 0 {depth}" mass="0.1"/></body>'
+        )
+    place = "{} {} {}".format(*at)
+    euler = "{} {} {}".format(*turn)
+    (folder / "three.xml").write_text(
+        '<mujoco><compiler angle="radian" eulerseq="XYZ"/><worldbody><body name="base" '
+        f'pos="{place}" euler="{euler}">{fingers}</body></worldbody></mujoco>'
+    )
+    points = "".join(f'[[contact_points]]\nlink = "f{i}"\n' for i in range(3))
+    (folder / "three.toml").write_text(f'model = "three.xml"\n{more}\n{points}')
+    return robot_of(folder / "three.toml")
+
+
+def test_a_found_palm_goes_with_its_hand_wherever_that_stands(tmp_path):
+    plain = three(tmp_path)
+    p, R = plain.palm(plain.home)
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    towards = plain.centers(plain.home + 0.5 * plain.closing.sum(axis=0)).mean(axis=0)
+    np.testing.assert_allclose(R[:, 2], towards / np.linalg.norm(towards), atol=0.1)
+    turn, at = (0.4, -0.8, 1.1), (0.3, 0.2, -0.5)
+    moved = three(tmp_path, turn, at)
+    T = pin.rpy.rpyToMatrix(*turn)
+    np.testing.assert_array_equal(moved.closing, plain.closing)
+    p_moved, R_moved = moved.palm(moved.home)
+    np.testing.assert_allclose(p_moved, T @ p + at, atol=1e-9)
+    sign = np.sign(R_moved[:, 0] @ T @ R[:, 0])  # an axis, which either way opposes
+    np.testing.assert_allclose(R_moved, T @ R * [sign, sign, 1.0], atol=1e-9)
+
+
+def test_opposition_is_along_which_fingers_come_together_most(tmp_path):
+    robot = three(tmp_path)
+    half = robot.home + 0.5 * robot.closing.sum(axis=0)
+    v = np.array([robot.jacobian(half)[3 * i : 3 * i + 3] @ robot.closing[i] for i in range(3)])
+    R = robot.palm(robot.home)[1]
+    across = v - np.outer(v @ R[:, 2], R[:, 2])
+    angles = np.linspace(0.0, np.pi, 181)
+    spread = [((across @ (np.cos(a) * R[:, 0] + np.sin(a) * R[:, 1])) ** 2).sum() for a in angles]
+    assert spread[0] == pytest.approx(max(spread))
+
+
+def test_jaws_amid_their_palm_approach_across_the_plane_they_close_in(tmp_path):
+    """Three slides towards the middle of their base: nothing else says where they point."""
+    fingers = ""
+    for i, angle in enumerate(2.0 * np.pi * np.arange(3) / 3.0):
+        x, y = np.cos(angle), np.sin(angle)
+        fingers += (
+            f'<body name="f{i}" pos="{0.05 * x} {0.05 * y} 0"><joint name="j{i}" type="slide" '
+            f'axis="{-x} {-y} 0" range="0 0.1"/><geom type="sphere" size="0.01"/></body>'
+        )
+    (tmp_path / "jaws.xml").write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body name="base" pos="0 0 0.2" '
+        f'euler="0.5 0 0">{fingers}</body></worldbody></mujoco>'
+    )
+    points = "".join(f'[[contact_points]]\nlink = "f{i}"\n' for i in range(3))
+    (tmp_path / "jaws.toml").write_text(f'model = "jaws.xml"\n{points}')
+    robot = robot_of(tmp_path / "jaws.toml")
+    p, R = robot.palm(robot.home)
+    np.testing.assert_allclose(p, [0, 0, 0.2], atol=1e-12)
+    normal = np.array([0, -np.sin(0.5), np.cos(0.5)])
+    assert abs(R[:, 2] @ normal) == pytest.approx(1.0)
