@@ -308,7 +308,7 @@ class PhysicalProbe:
         robot.place(self._data, q)
         for (tip, links), name in zip(self._own, names, strict=True):
             for link in links:
-                gap = mujoco.mj_geomDistance(robot.model, self._data, tip, link, 2.0 * NEAR, None)
+                gap = mujoco.mj_geomDistance(robot.model, self._data, tip, link, NEAR, None)
                 if gap < NEAR:
                     return Missed(Miss.OWN_LINK, name)
         R_world_tip = robot.tip_frames(q).copy()
