@@ -344,6 +344,73 @@ def test_a_capsule_rolls_as_a_ball_across_and_by_its_length_along(tmp_path):
     np.testing.assert_allclose(contact.stretch, expected, atol=1e-4)
 
 
+ROUND = {  # about x, by 0 and by 90 degrees: what the tip is rounded by where it is nearest
+    'type="sphere" size="0.01"': (0.01, 0.01),
+    'type="capsule" size="0.009 0.019"': (0.009, 0.009),
+    'type="cylinder" size="0.009 0.019"': (0.009, 0.009),
+    'type="box" size="0.006 0.008 0.019"': (0.0, 0.0),
+    'type="ellipsoid" size="0.006 0.008 0.019"': (0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("tip", ROUND)
+def test_what_a_tip_is_rounded_by_is_its_kinds_radius_and_a_cylinders_only_at_its_side(
+    tmp_path, tip
+):
+    for turn, radius in zip(("0 0 0", "1.5707963 0 0"), ROUND[tip], strict=True):
+        scene = before_a_wall(tmp_path, f'{tip} euler="{turn}"')
+        probe = GeometricProbe(scene)
+        scene.articulated.place(probe._data, np.zeros(7))
+        near = probe._nearest(0)
+        assert near.radius == radius
+        np.testing.assert_allclose(near.normal, [1, 0, 0], atol=1e-9)
+        half = {"sphere": 0.01, "capsule": 0.009, "cylinder": 0.009}.get(tip.split('"')[1], 0.006)
+        np.testing.assert_allclose([near.link[0], near.gap], [-half, 0.01 - half], atol=1e-8)
+    if "cylinder" in tip:
+        scene = before_a_wall(tmp_path, f'{tip} euler="0 1.5707963 0"')
+        probe = GeometricProbe(scene)
+        scene.articulated.place(probe._data, np.array([0.02, 0, 0, 0, 0, 0, 0]))
+        assert probe._nearest(0).radius == 0.0
+
+
+def test_of_a_link_of_several_geoms_the_nearest_touches(tmp_path):
+    """A knob on either side of a finger, one of them higher."""
+    for order in ((0.02, 0.01), (0.01, 0.02)):
+        knobs = "".join(
+            f'<geom type="sphere" size="0.004" pos="-{x} 0 {z}" mass="0.1"/>'
+            for x, z in zip(order, (0.08, 0.12), strict=True)
+        )
+        scene = before_a_wall(tmp_path, f'type="sphere" size="0.004" pos="0 0 0.1"/>{knobs}<site')
+        felt = GeometricProbe(scene).touch(np.zeros(7))
+        assert isinstance(felt, Grasp), felt
+        # The one that stands out further meets the wall first, where its own arc leads.
+        x, z = order[order.index(0.02)], (0.08, 0.12)[order.index(0.02)]
+        reach, angle = np.hypot(x, z), np.arctan2(x, z)
+        closed = np.arcsin((0.01 - 0.004) / reach) - angle
+        assert felt.q[-1] == pytest.approx(closed, abs=1e-6)
+        np.testing.assert_allclose(felt.positions[0, 0], -0.01, atol=1e-6)
+
+
+@pytest.mark.parametrize("tip", TIPS)
+def test_a_touch_goes_with_hand_and_object_wherever_both_are_moved(tmp_path, tip):
+    """Turned about the vertical, for objects stand upright."""
+    scene = before_a_wall(tmp_path, TIPS[tip])
+    turn, p = 2.2, np.array([0.3, -0.2, 0.4])
+    R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    wall = Prism(tuple(map(tuple, np.array(scene.object.polygon) @ R[:2, :2].T)), 0.6)
+    place = tuple(R @ scene.position + p)
+    moved = replace(scene.rebased(p, R), object=wall, position=place)
+    q = np.array([0.0, 0.01, 0.05, 0.02, -0.03, 0.04, 0.0])
+    one, other = (GeometricProbe(s).touch(q) for s in (scene, moved))
+    assert isinstance(one, Grasp) and isinstance(other, Grasp)
+    np.testing.assert_allclose(other.q, one.q, atol=1e-7)
+    np.testing.assert_allclose(other.normals, one.normals @ R.T, atol=1e-6)
+    np.testing.assert_allclose(other.positions, one.positions @ R.T + p, atol=1e-5)
+    np.testing.assert_allclose(other.jacobian, R @ one.jacobian, atol=1e-4)
+    turned = R @ one.contacts[0].stretch @ R.T
+    np.testing.assert_allclose(other.contacts[0].stretch, turned, atol=1e-4)
+
+
 def test_a_ball_has_no_stretch(world):
     for grasp in world.grasps:
         assert grasp.rolling is None

@@ -490,3 +490,92 @@ def test_a_finger_that_presses_less_than_half_of_what_it_holds_is_lost(scene):
         assert isinstance(felt, hg.Missed) is lost
         if lost:
             assert felt.reason is hg.Miss.LOST
+
+
+# ---------------------------------------------------------------- limits and faults
+
+
+def test_a_hand_stops_at_six_tenths_of_its_limit_and_at_nine_while_it_presses(scene):
+    hand = hg.SimulatedHand(scene, force_limit=10.0, grip_limit=30.0)
+    hand.place(CLOSED)
+    np.testing.assert_allclose(hand._guard, 6.0)
+    hand.move(CLOSED, 0.3)  # in free air: by a newton more than at its beginning
+    np.testing.assert_allclose(hand._guard, 1.0 + 9.81 * HEAVY, atol=2e-3)
+    hand.close(0, 0.5, 0.5)
+    np.testing.assert_allclose(hand._guard, 6.0)
+    hand.press(np.zeros(3))
+    np.testing.assert_allclose(hand._guard, 27.0)
+    hand.stop()
+    np.testing.assert_allclose(hand._guard, 6.0)
+    assert hand.limits.hold == pytest.approx(4.0)
+
+
+def test_a_move_ends_where_the_servos_miss_and_encoders_are_off_by_their_offset(scene):
+    hand = high(scene)
+    hand._errors.miss = lambda n: np.array([0.004, -0.02, 0.03])
+    np.testing.assert_allclose(go(hand, [0.25, 0.2, 0.1]).q[-1], [0.254, 0.18, 0.13], atol=1e-3)
+    hand._errors.encoder_offset = np.array([0.005, 0.02, -0.03])
+    read = go(hand, [0.25, 0.2, 0.1]).q[-1]
+    np.testing.assert_allclose(read, [0.254, 0.18, 0.13], atol=1e-3)
+    really = hand._state[hand._q]
+    np.testing.assert_allclose(really, read - [0.005, 0.02, -0.03], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("bump", "told", "stands"),
+    [
+        (None, "the sensor of right finger does not answer", 45),
+        (42, "contact force above 1.1 N at left finger", 44),  # it comes first
+        (60, "the sensor of right finger does not answer", 45),
+    ],
+)
+def test_what_happens_first_in_a_move_is_what_stops_it(scene, bump, told, stands):
+    """A sensor that repeats itself is dead at the fifth sample; a force counts at its second."""
+    hand = high(scene)
+    hand.move(np.array([0.2, 0.3, 0.3]), 0.5)
+    T = 100
+    state, _ = hand._run(hand._plan(T))
+    wrench = np.random.default_rng(0).normal(scale=1e-3, size=(T, 2, 6))
+    wrench[40:, 1] = wrench[40, 1]
+    if bump is not None:
+        wrench[bump : bump + 2, 0, 2] = 2.0
+        wrench[20, 0, 2] = 50.0  # a spike is nothing
+    assert hand._react(state, wrench, np.zeros((T, 3))) == stands
+    assert hand._fault == told
+    np.testing.assert_array_equal(hand._state, state[stands - 1])
+
+
+def test_two_sensors_dead_at_once_are_a_hand_that_feels_nothing_and_no_fault_of_one(scene):
+    hand = high(scene)
+    hand.move(np.array([0.2, 0.3, 0.3]), 0.5)
+    state, _ = hand._run(hand._plan(100))
+    assert hand._react(state, np.zeros((100, 2, 6)), np.zeros((100, 3))) == 100
+    assert hand._fault == ""
+
+
+class Lazy(Noting):
+    """Closes nothing, and says nothing of it."""
+
+    def close(self, finger, speed, force):
+        self.calls.append(("close", self.time, finger, speed, force))
+
+
+def test_a_finger_that_takes_far_longer_than_its_range_does_not_close(scene):
+    hand = Lazy(scene)
+    hand.place(CLOSED)
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(CLOSED)
+    assert felt == hg.Missed(hg.Miss.NO_TOUCH, "left finger")
+    closing = [call for call in hand.calls if call[0] == "close"]
+    back = [call for call in hand.calls if call[0] == "move"][2]
+    # 3 s beyond what the wider finger needs from 0.1 − 0.35 rad on, at 0.3 rad/s
+    assert back[1] - closing[2][1] == pytest.approx(3.0 + (1.2 + 0.25) / 0.3, abs=0.15)
+
+
+def test_a_silent_sensor_is_waited_for_by_two_seconds(scene):
+    fault = hg.world.imperfections.Fault("freeze", 1, 0.0)
+    about = hg.Imperfections(force_noise=1e-3, faults=(fault,))
+    hand = Noting(scene, hg.Physics(imperfections=about))
+    hand.place(CLOSED)
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(CLOSED)
+    assert felt == hg.Missed(hg.Miss.SENSOR, "right finger")
+    assert hand.time == pytest.approx(2.0, abs=0.06) and hand.calls == []

@@ -1,6 +1,7 @@
 """Objects and scenes: what is refused, and that the compiled shapes are those asked for."""
 
 import pickle
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -231,3 +232,45 @@ def test_a_robot_that_uses_the_objects_name_is_refused(tmp_path):
     xml = tiny_hand.XML.replace('name="distal"', 'name="object"').replace('"distal"', '"object"')
     with pytest.raises((InputError, ModelError), match=r"tiny\.xml.*'object'"):
         Scene(tiny_hand.write(tmp_path, xml), Cylinder(0.05)).model  # noqa: B018
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_robot_of_ones_own_is_saved_by_its_whole_path(tmp_path, monkeypatch, kind):
+    (tmp_path / "mine").mkdir()
+    tiny_hand.write(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    scene = Scene(kind("./mine/../mine/"), Cylinder(0.02), (0.1, 0.2, 0.3), (1, 2, 3, 0, 1, 0, 0))
+    if kind is str:
+        scene = Scene("mine/robot.toml", scene.object, scene.position, scene.base)
+    scene.save("scene.json")
+    monkeypatch.chdir("/")
+    loaded = Scene.load(tmp_path / "scene.json")
+    assert (loaded.object, loaded.position, loaded.base, loaded.hand) == (
+        (scene.object, scene.position, scene.base, scene.hand)
+    )
+    assert Path(loaded.robot).is_absolute()
+    assert loaded.articulated.joints == ("lift", "proximal")
+
+
+def test_a_scene_of_the_packages_robots_is_saved_by_name_with_its_hand(tmp_path):
+    scene = Scene("umass_torso", Cylinder(0.02), (0.1, 0.2, 0.3), hand="left")
+    scene.save(tmp_path / "scene.json")
+    assert Scene.load(tmp_path / "scene.json") == scene
+
+
+def test_a_base_that_is_moved_twice_is_moved_by_both(tmp_path):
+    """x ↦ R x + p, the last one last; the object stays."""
+    scene = Scene(tiny_hand.write(tmp_path), Cylinder(0.02), (0.5, 0.0, 0.0))
+    R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # z by 90°
+    S = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x by 90°
+    p, s = np.array([0.1, 0.2, 0.3]), np.array([-0.3, 0.0, 0.05])
+    moved = scene.rebased(p, R).rebased(s, S)
+    q = np.array([0.2, 0.4])
+    expected = (scene.articulated.centers(q) @ R.T + p) @ S.T + s
+    np.testing.assert_allclose(moved.articulated.centers(q), expected, atol=1e-12)
+    palm = S @ R @ scene.articulated.palm(q)[1]
+    np.testing.assert_allclose(moved.articulated.palm(q)[1], palm, atol=1e-12)
+    assert np.linalg.norm(moved.base[3:]) == pytest.approx(1.0, abs=1e-12)
+    assert moved.position == scene.position
+    with pytest.raises(InputError, match="unit quaternion"):
+        Scene(scene.robot, scene.object, scene.position, (0, 0, 0, 1, 1e-4, 0, 0))
