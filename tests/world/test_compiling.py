@@ -164,6 +164,9 @@ def test_a_mesh_that_was_emptied_or_cut_off_is_refused_by_its_file(
         (b"", "has no faces"),
         (b"f 1 2 4\nf 5 8 6\nf 1 4", "ends amid the line 'f 1 4'"),
         (b"f 1 2 4\nf 1 8 6\n", "has 8 vertices, of which its faces use 5"),
+        (b"f 1 2 4\nf 1 8 6\nf -8 -7 -5\nf -8 -1 -3\n", "has 8 vertices, of which its faces use 5"),
+        (b"f 1 2 4\nf 1/1 8/1 6/7\n\n", "has 8 vertices, of which its faces use 5"),
+        (b"f 1 2 4\nf 5 8 6\nf 3 1 4", "has 8 vertices, of which its faces use 7"),
     ],
 )
 def test_an_obj_that_ends_early_is_refused_for_what_shows_it(tmp_path, ending, message):

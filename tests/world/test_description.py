@@ -302,6 +302,25 @@ def test_a_carriage_holds_the_palm_as_a_start_does(tmp_path):
     )  # all six ways, about the palm
 
 
+def test_a_carriage_turns_about_the_palm_wherever_on_its_hand_that_is(tmp_path):
+    """Fixed axes of the world at zero: x, y and z, then yaw, pitch and roll about its own."""
+    at = "pos = [0.1, -0.2, 0.3], approach = [0, 1, 0], opposition = [1, 0, 0]"
+    robot = robot_of(claw(tmp_path, toml=f'carriage = true\npalm = {{ body = "base", {at} }}'))
+    p, R = robot.palm(robot.home)
+    level, down = np.cos(np.radians(40)), np.sin(np.radians(40))
+    np.testing.assert_allclose(p, 0.0, atol=1e-9)
+    np.testing.assert_allclose(R[:, 2], [level, 0, -down], atol=1e-9)
+    np.testing.assert_allclose(R[:, 0], [0, 1, 0], atol=1e-9)
+    q = robot.home.copy()
+    q[:6] = [0.1, 0.2, 0.3, 0.4, -0.5, 0.6]
+    p, turned = robot.palm(q)
+    np.testing.assert_allclose(p, [0.1, 0.2, 0.3], atol=1e-9)
+    x, y, z = (
+        pin.rpy.rpyToMatrix(*(a * e)) for a, e in zip((0.6, -0.5, 0.4), np.eye(3), strict=True)
+    )
+    np.testing.assert_allclose(turned, z @ y @ x @ R, atol=1e-9)
+
+
 def test_a_carriage_turns_as_far_whatever_the_files_angles_are_in(tmp_path):
     palm = 'palm = { body = "palm", approach = [1, 0, 0], opposition = [0, 1, 0] }'
     xml = XML[: XML.index("  <keyframe>")] + "</mujoco>"

@@ -281,3 +281,96 @@ def test_a_body_is_a_value_that_knows_its_content(tmp_path, monkeypatch):
         Scene.load(tmp_path / "scene.json")
     with pytest.raises(InputError, match=r"thing\.xml has changed"):
         eval(repr(body))
+
+
+TURNED = mjcf(
+    "<geom type='box' size='0.02 0.03 0.05' pos='0.01 0.02 0' euler='20 0 40'/>"
+    "<body pos='0 0.01 0.04' euler='0 60 0'><geom type='capsule' size='0.01 0.02' pos='0 0 0.02'/>"
+    "</body>"
+)
+
+
+def test_geoms_stand_as_they_are_turned_in_the_file_whatever_the_scale(tmp_path):
+    """Seen from the middle of the box around all of them, the body's own turn is the file's."""
+    path = write(tmp_path, TURNED, "thing.xml")
+    spec = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(spec)
+    mujoco.mj_kinematics(spec, data)
+    for scale in (1.0, 0.5):
+        scene = Scene(object=Body(path, scale=scale))
+        model, there = scene.model, mujoco.MjData(scene.model)
+        mujoco.mj_kinematics(model, there)
+        apart = []
+        for g, name in enumerate((OBJECT, f"{OBJECT}_1")):
+            geom = model.geom(name).id
+            np.testing.assert_allclose(there.geom_xmat[geom], data.geom_xmat[g], atol=1e-9)
+            np.testing.assert_allclose(model.geom_size[geom], scale * spec.geom_size[g])
+            apart.append(there.geom_xpos[geom] - scale * data.geom_xpos[g])
+        np.testing.assert_allclose(apart[0], apart[1], atol=1e-9)
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for name in (OBJECT, f"{OBJECT}_1"):
+            geom = model.geom(name).id
+            signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+            box = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+            points = there.geom_xpos[geom] + box @ there.geom_xmat[geom].reshape(3, 3).T
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        np.testing.assert_allclose((low + high) / 2, scene.position, atol=1e-9)
+
+
+GEOM = "<geom type='box' size='0.02 0.03 0.05' pos='0 0 {z}' euler='0 0 {turn}' {more}/>"
+PLAIN = {"z": 0, "turn": 0, "more": ""}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"z": 0.01},
+        {"turn": 10},
+        {"more": "rgba='1 0 0 1'"},
+        {"more": "contype='0' conaffinity='0'"},
+    ],
+)
+def test_content_tells_shapes_that_differ_in_place_turn_look_or_touch(tmp_path, other):
+    core = "<geom type='sphere' size='0.04'/>"
+    plain = Body(write(tmp_path, mjcf(core + GEOM.format(**PLAIN)), "a.xml"))
+    differs = Body(write(tmp_path, mjcf(core + GEOM.format(**PLAIN | other)), "b.xml"))
+    same = Body(write(tmp_path, mjcf(core + GEOM.format(**PLAIN)), "c.xml"))
+    assert plain.content == same.content != differs.content
+    assert plain.content.startswith("sha256:")
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [(0.9, ""), (1.1, "--scale 0.001"), (0.006, ""), (0.004, "too small to be grasped")],
+)
+def test_a_body_is_between_half_a_centimetre_and_a_metre_large(tmp_path, size, message):
+    path = write(tmp_path, mjcf(f"<geom type='sphere' size='{size / 2}'/>"), "thing.xml")
+    if not message:
+        assert Body(path).content
+        return
+    with pytest.raises(InputError, match=message):
+        Body(path)
+
+
+def test_the_side_of_an_upright_object_is_steep_and_a_rounded_one_leans_by_thirty_degrees():
+    assert Body.steepest == pytest.approx(np.sin(np.radians(30)))
+    assert np.degrees(np.arcsin([Cylinder.steepest, Prism.steepest])).max() < 3.0
+    assert Cylinder(0.05).height == Prism(((1, 0), (0, 1), (-1, -1))).height == 0.12
+
+
+@pytest.mark.parametrize(("notch", "warns"), [(0.08, False), (0.3, True)])
+def test_a_mesh_that_fills_nine_tenths_of_its_hull_is_taken_without_a_word(tmp_path, notch, warns):
+    """A square with a corner cut inwards, extruded: it fills 1 − notch/2 of its hull."""
+    outline = [(0, 0), (1, 0), (1, 1), (0.5, 1 - notch), (0, 1)]
+    bottom, top = np.array([(*p, 0) for p in outline]), np.array([(*p, 1) for p in outline])
+    caps = [(0, 1, 3), (1, 2, 3), (0, 3, 4)]
+    faces = [(a, c, b) for a, b, c in caps] + [(a + 5, b + 5, c + 5) for a, b, c in caps]
+    for i in range(5):
+        j = (i + 1) % 5
+        faces += [(i, j, j + 5), (i, j + 5, i + 5)]
+    path = write_obj(tmp_path, 0.08 * np.concatenate([bottom, top]), faces)
+    if not warns:
+        assert Body(path).content
+        return
+    with pytest.warns(UserWarning, match=f"fills {1 - notch / 2:.0%} of its convex hull"):
+        Body(path)

@@ -10,6 +10,7 @@ import tiny_hand
 from tiny_hand import TOML, XML, change
 
 from hqp_grasp.errors import InputError, ModelError
+from hqp_grasp.grasp import Contact
 from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
@@ -522,3 +523,140 @@ def test_q_must_be_one_finite_angle_for_each_joint(tmp_path, q):
     robot = build(tmp_path)
     with pytest.raises(InputError, match="q_target must be 2 finite angles, for lift, proximal"):
         robot.require_q("q_target", q)
+
+
+# ---------------------------------------------------------------- bounds, links, opening
+
+
+def test_no_place_of_a_link_moves_faster_than_reach_and_the_straight_finger_as_fast(tmp_path):
+    """The ball's centre is 0.1 m from the proximal axis, 0.04 m from the distal one, at half."""
+    np.testing.assert_allclose(build(tmp_path).reach, [[1.0, 0.1 + 0.5 * 0.04]], atol=EXACT)
+    beside = change(XML, 'axis="0 0 1" range="0 3"', 'axis="0 0 1" pos="0 -0.03 0.04" range="0 3"')
+    robot = build(tmp_path, beside)
+    np.testing.assert_allclose(robot.reach, [[1.0, 0.1 + 0.05 + 0.5 * 0.04]], atol=EXACT)
+    box = 'type="box" size="0.01 0.02 0.02"'  # 0.03 to its corners
+    toml = change(TOML, 'site = "tip_center"\n', "")
+    robot = build(tmp_path, change(XML, 'type="sphere" size="0.01"', box), toml)
+    np.testing.assert_allclose(robot.reach, [[1.0, 0.13 + 0.5 * 0.07]], atol=EXACT)
+
+
+def test_a_slide_on_the_way_carries_a_link_further_from_the_joints_below(tmp_path):
+    xml = change(XML, 'name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"',
+                 'name="lift" axis="0 1 0" range="-0.5 0.5"')  # fmt: skip
+    slide = '<joint name="out" type="slide" axis="1 0 0" range="-0.3 0.2"/><joint name="proximal"'
+    xml = change(change(xml, '<joint name="proximal"', slide), 'qpos="0', 'qpos="0 0')
+    robot = build(tmp_path, xml, change(TOML, "lift = 0.1", "lift = 0.1\nout = 0.1"))
+    np.testing.assert_allclose(robot.reach, [[0.1 + 0.3, 1.0, 0.1 + 0.5 * 0.04]], atol=EXACT)
+    for q in postures(robot, seed=11):
+        speeds = np.linalg.norm(robot.jacobian(q), axis=0)
+        assert (speeds <= robot.reach[0] + EXACT).all()
+
+
+def test_reach_bounds_every_contact_point(robot):
+    for q in postures(robot, seed=12):
+        speeds = np.linalg.norm(robot.jacobian(q).reshape(3, 3, -1), axis=1)
+        assert (speeds <= robot.reach + EXACT).all()
+
+
+def test_a_point_of_a_link_goes_with_it(robot):
+    """Its place on the link is kept, and its rate is the link's Jacobian there."""
+    rng = np.random.default_rng(13)
+    for q in postures(robot, seed=13, count=3):
+        for i in range(3):
+            x = robot.centers(q)[i] + rng.normal(scale=0.02, size=3)
+            point = np.zeros((3, 3))
+            point[i] = robot.on_link(q, i, x)
+            np.testing.assert_allclose(robot.centers(q, point)[i], x, atol=EXACT)
+            J = robot.link_jacobian(q, i, x)
+            np.testing.assert_allclose(J, robot.jacobian(q, point)[3 * i : 3 * i + 3], atol=EXACT)
+            rates = [
+                (robot.centers(q + d, point)[i] - robot.centers(q - d, point)[i]) / (2 * FD_STEP)
+                for d in FD_STEP * np.eye(robot.n)
+            ]
+            np.testing.assert_allclose(J, np.transpose(rates), atol=FD_TOL)
+
+
+def test_what_is_returned_is_the_callers_own(robot):
+    q = robot.home.copy()
+    kept = [np.copy(a) for a in (*robot.bodies(q), robot.jacobian(q), robot.palm(q)[0])]
+    handed = (*robot.bodies(q), robot.jacobian(q), robot.palm(q)[0])
+    opened = robot.opened(q)
+    for array in (*handed, opened):
+        array += 1.0
+    np.testing.assert_array_equal(q, robot.home)
+    again = (*robot.bodies(q), robot.jacobian(q), robot.palm(q)[0])
+    for one, other in zip(again, kept, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_posture_that_is_changed_in_place_is_another_posture(robot):
+    q = robot.home.copy()
+    first = robot.centers(q).copy()
+    q[0] += 0.1
+    assert np.abs(robot.centers(q) - first).max() > 1e-3
+    q[0] -= 0.1
+    np.testing.assert_allclose(robot.centers(q), first, atol=EXACT)
+
+
+TWO_MOTORS = change(
+    change(XML, 'range="-0.1 0.8"', 'range="-0.1 0.8" ref="0"'), "  <equality>", "  <!-- "
+).replace("</equality>", " -->")
+
+
+def test_a_finger_opens_until_its_first_joint_ends_and_closes_until_its_last_does(tmp_path):
+    """By shares of all that it can, from wherever it is; the arm stays."""
+    toml = change(TOML, 'flexion = ["proximal"]', "flexion = { proximal = 1.0, distal = -0.5 }")
+    robot = build(tmp_path, TWO_MOTORS, toml)
+    np.testing.assert_allclose(robot.closing, [[0.0, 1.0, -0.5]], atol=EXACT)
+    q = np.array([0.2, 1.0, 0.6])  # it opens by 0.4, and closes by 2.0 and, distal, by 1.4
+    np.testing.assert_allclose(robot.opened(q), [0.2, 0.6, 0.8], atol=EXACT)
+    np.testing.assert_allclose(robot.opened(q, 1.0), [0.2, 3.0, -0.1], atol=EXACT)
+    half = -0.5 * 0.4 + 0.5 * 2.0
+    np.testing.assert_allclose(robot.opened(q, 0.5), [0.2, 1.0 + half, 0.6 - half / 2], atol=EXACT)
+    np.testing.assert_array_equal(q, [0.2, 1.0, 0.6])
+
+
+def test_a_finger_without_ranges_opens_and_closes_by_a_radian(tmp_path):
+    xml = change(TWO_MOTORS, 'axis="0 0 1" range="0 3"', 'axis="0 0 1"')
+    robot = build(tmp_path, xml)
+    q = np.array([0.1, 5.0, 0.3])
+    np.testing.assert_allclose(robot.opened(q), [0.1, 4.0, 0.3], atol=EXACT)
+    np.testing.assert_allclose(robot.opened(q, 1.0), [0.1, 6.0, 0.3], atol=EXACT)
+
+
+@pytest.mark.parametrize(
+    ("angle", "weight"), [(0, 1.0), (40, 1.0), (50, 0.0), (130, 0.0), (140, -1.0), (180, -1.0)]
+)
+def test_joints_that_bend_a_finger_alike_close_it_and_others_do_not(tmp_path, angle, weight):
+    """Parallel to the last one by a cosine of 0.7, signed."""
+    axis = f"{np.sin(np.radians(angle))} 0 {np.cos(np.radians(angle))}"
+    xml = change(TWO_MOTORS, 'name="proximal" axis="0 0 1"', f'name="proximal" axis="{axis}"')
+    robot = build(tmp_path, xml, change(TOML, 'flexion = ["proximal"]', ""))
+    np.testing.assert_allclose(robot.closing, [[0.0, weight, 1.0]], atol=EXACT)
+
+
+def test_a_grasp_is_complete_with_what_the_robot_knows(robot):
+    """Of a ball that is felt with noise the place is that which its normal tells."""
+    q, rng = robot.home, np.random.default_rng(14)
+    centers = robot.centers(q)
+    normals = rng.normal(size=(3, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    places = centers + rng.normal(scale=0.01, size=(3, 3))
+    for noise in (0.0, 0.01):
+        contacts = [Contact(p, n, noise=noise) for p, n in zip(places, normals, strict=True)]
+        grasp = robot.grasp(q, contacts, ("link",))
+        expected = centers - 0.008 * normals if noise else places
+        np.testing.assert_allclose(grasp.positions, expected, atol=EXACT)
+        np.testing.assert_allclose(grasp.normals, normals, atol=EXACT)
+        assert grasp.other_links == ("link",) and grasp.rolling is None
+        np.testing.assert_array_equal(grasp.jacobian, robot.jacobian(q))
+        np.testing.assert_array_equal(grasp.hessian, robot.hessian(q))
+        np.testing.assert_array_equal(grasp.coupling, robot.coupling)
+        for i, contact in enumerate(grasp.contacts):
+            assert contact.name == robot.description.contact_points[i].name
+            assert contact.flexion == robot.flexion[i] and contact.tip_radius == 0.008
+            site = robot.model.site(robot.description.contact_points[i].site)
+            assert robot.model.body(contact.body).id == site.bodyid[0]
+            np.testing.assert_allclose(contact.point, site.pos, atol=EXACT)
+    with pytest.raises(InputError, match=r"touches with 3 points .*; got 2 contacts"):
+        robot.grasp(q, contacts[:2])

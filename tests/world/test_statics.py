@@ -153,6 +153,9 @@ def test_a_motor_of_two_joints_and_a_joint_without_a_limit_are_told(tmp_path):
         torque_limits(tiny(tmp_path, with_motors(both)))
     with pytest.raises(ModelError, match=r"no force limit for the motors of: lift, proximal; give"):
         torque_limits(tiny(tmp_path, tiny_hand.XML))
+    for ends in ("-inf 2", "-2 inf"):
+        with pytest.raises(ModelError, match=r"no force limit for the motors of: proximal; give"):
+            torque_limits(tiny(tmp_path, with_motors(change(MOTORS, "-2 2", ends))))
     unlimited = change(MOTORS, ' gear="3" forcerange="-2 2"', "")
     with pytest.raises(ModelError, match=r"no force limit for the motors of: proximal; give"):
         torque_limits(tiny(tmp_path, with_motors(unlimited)))
