@@ -176,3 +176,16 @@ def test_a_circle_is_told_file_by_file_lazy_or_not(tmp_path):
 def test_a_room_without_a_floor_is_told(tmp_path):
     (told,) = wrong_ways(house(tmp_path, attic__box=""))
     assert told.startswith("hqp_grasp/attic/box.py: no floor")
+
+
+def test_values_are_frozen():
+    """Every dataclass is one, but what a lift notes of itself as it goes."""
+    thawed = [
+        node.name
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+        for mark in map(ast.unparse, node.decorator_list)
+        if mark.startswith("dataclass") and "frozen=True" not in mark
+    ]
+    assert thawed == ["_Looking"]

@@ -563,12 +563,12 @@ class Lazy(Noting):
 def test_a_finger_that_takes_far_longer_than_its_range_does_not_close(scene):
     hand = Lazy(scene)
     hand.place(CLOSED)
-    felt = hg.PhysicalProbe(hand, scene.articulated).touch(CLOSED)
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(np.array([0.0, -0.1, 0.15]))
     assert felt == hg.Missed(hg.Miss.NO_TOUCH, "left finger")
     closing = [call for call in hand.calls if call[0] == "close"]
     back = [call for call in hand.calls if call[0] == "move"][2]
-    # 3 s beyond what the wider finger needs from 0.1 − 0.35 rad on, at 0.3 rad/s
-    assert back[1] - closing[2][1] == pytest.approx(3.0 + (1.2 + 0.25) / 0.3, abs=0.15)
+    # 3 s beyond what the wider finger needs from −0.45 rad on, at 0.3 rad/s
+    assert back[1] - closing[2][1] == pytest.approx(3.0 + (1.2 + 0.45) / 0.3, abs=0.15)
 
 
 def test_a_silent_sensor_is_waited_for_by_two_seconds(scene):
