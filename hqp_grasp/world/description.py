@@ -358,28 +358,32 @@ class RobotDescription:
 
     def spec(self) -> mujoco.MjSpec:
         """The described model, ready to be composed with others."""
-        spec, fixed = self._joined()
+        spec, fixed, units = self._joined()
         if self.carriage:
             self._put_on_carriage(spec)
-        self._change(spec, fixed)
+        self._change(spec, fixed, units)
         return spec
 
-    def _joined(self) -> tuple[mujoco.MjSpec, set[str]]:
-        """The files as one model, and the free bases that `lock` fixed in it."""
+    def _joined(self) -> tuple[mujoco.MjSpec, set[str], dict[str, float]]:
+        """The files as one model, the free bases that `lock` fixed in it, and units of angles.
+
+        What 1 in the angles of a joint is [rad], its own file says.
+        """
         if not self.files[0].stands_alone:
             raise ModelError(
                 f"{self.files[0].file.name} is the first file of {self.name}: pos, quat and prefix "
                 "are for those that are joined to it"
             )
-        spec, fixed = self._part(self.files[0])
+        spec, fixed, units = self._part(self.files[0])
         for part in self.files[1:]:
             if not part.prefix:
                 raise ModelError(
                     f"{part.file.name} is joined to other files and needs a prefix before its "
                     'names, such as prefix = "hand_"'
                 )
-            child, more = self._part(part)
+            child, more, of_child = self._part(part)
             fixed |= more
+            units |= of_child
             body = spec.body(part.at) if part.at else spec.worldbody
             if body is None:
                 _known("body", part.at, [b.name for b in spec.bodies], f"at of {part.file.name}")
@@ -388,11 +392,13 @@ class RobotDescription:
                 spec.attach(child, prefix=part.prefix, frame=frame)
             except ValueError as error:
                 raise ModelError(f"{part.file.name} cannot be joined: {error}") from error
-        return spec, fixed
+        return spec, fixed, units
 
-    def _part(self, part: ModelFile) -> tuple[mujoco.MjSpec, set[str]]:
-        """One of the files, without keyframes, and the free bases that `lock` fixed in it."""
+    def _part(self, part: ModelFile) -> tuple[mujoco.MjSpec, set[str], dict[str, float]]:
+        """One of the files, without keyframes; and of it what `_joined` has of all."""
         spec, fixed = part.spec(), set()
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        units = {part.prefix + j.name: _angle_unit(spec) for j in spec.joints if j.type != slide}
         self._refuse_ranges(part, spec)
         spec.compiler.conflict = mujoco.mjtConflict.mjCONFLICT_MERGE
         for joint in [j for j in spec.joints if j.type == FREE]:
@@ -415,7 +421,7 @@ class RobotDescription:
         # They are read by now, joint by joint; in a larger model they would list others' angles.
         for key in list(spec.keys):
             spec.delete(key)
-        return spec, fixed
+        return spec, fixed, units
 
     def _refuse_ranges(self, part: ModelFile, spec: mujoco.MjSpec) -> None:
         """Raise for a range that is reversed, a single angle, or no number."""
@@ -474,20 +480,9 @@ class RobotDescription:
             unit = 1.0 if slides else _angle_unit(spec)
             joint.range, joint.limited = np.array(ends) / unit, mujoco.mjtLimited.mjLIMITED_TRUE
 
-    def _units(self) -> dict[str, float]:
-        """Of each joint whose file gives angles in degrees, what one of them is [rad]."""
-        return {
-            part.prefix + joint.name: _angle_unit(spec)
-            for part in self.files
-            for spec in [part.spec()]
-            for joint in spec.joints
-            if joint.type != mujoco.mjtJoint.mjJNT_SLIDE and spec.compiler.degree
-        }
-
-    def _change(self, spec: mujoco.MjSpec, fixed: set[str]) -> None:
+    def _change(self, spec: mujoco.MjSpec, fixed: set[str], units: Mapping[str, float]) -> None:
         """Do to the model what the description asks for; `fixed` bases are so already."""
         joints = {joint.name: joint for joint in spec.joints}
-        units = self._units() if self.ranges or self.couplings or self.lock else {}
         refs = {name: joint.ref * units.get(name, 1.0) for name, joint in joints.items()}
         for name, ends in self.ranges.items():
             joint = joints[self._joint(name, joints, "ranges")]
@@ -563,7 +558,7 @@ class RobotDescription:
     @property
     def equalities(self) -> dict[str, bool]:
         """The files' equalities by name, or joint: whether each stays in force."""
-        spec, _ = self._joined()
+        spec, *_ = self._joined()
         return {e.name or e.name1: not self._drops(e) for e in spec.equalities}
 
     def _joint(self, name: str, joints: Mapping[str, object], where: str) -> str:

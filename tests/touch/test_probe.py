@@ -411,6 +411,40 @@ def test_a_touch_goes_with_hand_and_object_wherever_both_are_moved(tmp_path, tip
     np.testing.assert_allclose(other.contacts[0].stretch, turned, atol=1e-4)
 
 
+def test_an_ellipsoid_rolls_by_its_mean_radius_there_and_the_rest_is_its_stretch(tmp_path):
+    """Where its normal is n it touches at A² n/|A n|; between tilts of 0.1 rad to either side."""
+    scene = before_a_wall(tmp_path, TIPS["ellipsoid"])
+    (contact,) = GeometricProbe(scene).touch(np.zeros(7)).contacts
+    R = mujoco_turn(scene, contact)
+    A = np.array([0.006, 0.008, 0.019])
+    n = R.T @ contact.normal
+    run = []
+    for turn in tangents(contact.normal):
+        there = []
+        for angle in (0.1, -0.1):
+            tilted = np.cos(angle) * n + np.sin(angle) * (R.T @ turn)
+            there.append(-(A**2) * tilted / np.linalg.norm(A * tilted))
+        run.append(R @ (there[1] - there[0]) / (2.0 * np.sin(0.1)))
+    T = np.array(tangents(contact.normal))
+    M = T @ np.transpose(run)
+    assert contact.tip_radius == pytest.approx(0.5 * np.trace(M), rel=1e-3)
+    rest = T.T @ (M - contact.tip_radius * np.eye(2)) @ T
+    np.testing.assert_allclose(contact.stretch, rest, atol=1e-4)
+
+
+def mujoco_turn(scene, contact):
+    """Of the finger as it touches (3, 3)."""
+    robot = scene.articulated
+    grasp = GeometricProbe(scene).touch(np.zeros(7))
+    return robot._at(grasp.q).body("finger").xmat.reshape(3, 3).copy()
+
+
+def tangents(normal):
+    one = np.cross(normal, [0.0, 1.0, 0.0])
+    one /= np.linalg.norm(one)
+    return one, np.cross(normal, one)
+
+
 def test_a_ball_has_no_stretch(world):
     for grasp in world.grasps:
         assert grasp.rolling is None

@@ -579,3 +579,57 @@ def test_a_silent_sensor_is_waited_for_by_two_seconds(scene):
     felt = hg.PhysicalProbe(hand, scene.articulated).touch(CLOSED)
     assert felt == hg.Missed(hg.Miss.SENSOR, "right finger")
     assert hand.time == pytest.approx(2.0, abs=0.06) and hand.calls == []
+
+
+def held_with(scene, forces, steps=20):
+    """Readings of two tips that press with these forces [N]."""
+    wrench = np.zeros((steps, 2, 6))
+    wrench[:, :, 2] = forces
+    time, q = 0.01 * np.arange(steps), np.zeros((steps, 3))
+    return Readings(time, q, q, wrench, np.ones(2, bool), np.zeros(2, bool))
+
+
+@pytest.mark.parametrize(
+    ("seen", "last"),
+    [
+        ([(0.2, 0.2), (1.03, 0.97), (5.0, 5.0)], (5.0, 5.0)),  # settled: what comes then
+        ([(0.2, 1.0), (0.5, 0.4), (0.9, 0.3)] * 3, (0.5, 0.4)),  # it slides: the best there was
+        ([(1.05, 1.0)] * 9, (1.05, 1.0)),
+    ],
+)
+def test_contacts_are_sensed_once_the_held_force_is_there_or_at_its_best(scene, seen, last):
+    """It is there within 4 %; a finger that slides is given 0.3 s, and 0.3 s by newton."""
+    probe = hg.PhysicalProbe(hg.SimulatedHand(scene), scene.articulated, force=1.0)
+    waited = []
+
+    def wait(duration):
+        waited.append(duration)
+        return held_with(scene, np.add(seen[len(waited) - 1], 0.5))
+
+    object.__setattr__(probe, "_wait", wait)
+    free = held_with(scene, (0.5, 0.5))
+    found = probe._settle(free)
+    np.testing.assert_allclose(found.wrench[0, :, 2] - 0.5, last)
+    assert waited[-1] == (0.2 if last[0] > 4.0 else 0.1) and set(waited[:-1]) == {0.1}
+    assert sum(waited) == pytest.approx(0.4 if last[0] > 4.0 else 0.6, abs=0.11)
+
+
+def test_averages_leave_out_spikes_and_their_noise_is_that_of_the_samples(scene):
+    probe = hg.PhysicalProbe(hg.SimulatedHand(scene), scene.articulated, force=1.0)
+    rng = np.random.default_rng(0)
+    sigma = np.array([0.02, 0.03, 0.04, 1e-4, 2e-4, 3e-4])
+    plain = held_with(scene, (1.0, 2.0), steps=4000)
+    drift = np.linspace(0.0, 0.3, 4000)[:, None, None]
+    noisy = plain.wrench + sigma * rng.normal(size=plain.wrench.shape) + drift * (sigma > 1e-3)
+    spiky = noisy.copy()
+    spiky[::100, 0, 0] += 30.0
+    for wrench in (noisy, spiky):
+        read = Readings(plain.time, plain.q, plain.q, wrench, plain.touched, plain.stalled)
+        np.testing.assert_allclose(
+            probe._steady(read) - plain.wrench[0], [0.15 * (sigma > 1e-3)] * 2, atol=3e-3
+        )
+        np.testing.assert_allclose(probe._variance(read), [sigma**2] * 2, rtol=0.1)
+        samples = 4000 - 40 * (wrench is spiky)
+        np.testing.assert_allclose(
+            probe._unsure(read)[0], probe._variance(read)[0] / samples, rtol=1e-9
+        )
