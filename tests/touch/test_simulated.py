@@ -633,3 +633,89 @@ def test_averages_leave_out_spikes_and_their_noise_is_that_of_the_samples(scene)
         np.testing.assert_allclose(
             probe._unsure(read)[0], probe._variance(read)[0] / samples, rtol=1e-9
         )
+
+
+def sensed(scene, q, ways, force=1.0, table=None):
+    """What a probe says of tips that meet pushes: each a normal and its force, world."""
+    robot = scene.articulated
+    probe = hg.PhysicalProbe(hg.SimulatedHand(scene), robot, force, table)
+    R, load = robot.tip_frames(q).copy(), payload(robot)
+    wrench = np.empty((2, 6))
+    for i, (normal, f) in enumerate(ways):
+        wrench[i] = [*(R[i].T @ f), *(R[i].T @ np.cross(-TIP * np.asarray(normal), f))]
+    free = held_with(scene, (0.0, 0.0))
+    open_q = np.array([0.0, -0.4, -0.3])
+    readings = []
+    for at, felt in ((open_q, np.zeros((2, 6))), (np.asarray(q), wrench)):
+        frames = robot.tip_frames(at)
+        told = np.tile(felt + weight(load, frames), (20, 1, 1))
+        qs = np.tile(at, (20, 1))
+        readings.append(Readings(free.time, qs, qs, told, free.touched, free.stalled))
+    return probe._sense(*readings)
+
+
+AT = np.array([0.0, 0.18, 0.19])
+LEFT, RIGHT = np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+
+
+def test_pushes_are_told_in_the_world_with_their_place_and_torque(scene):
+    rng = np.random.default_rng(1)
+    ways = []
+    for normal in (LEFT, RIGHT):
+        n = normal + rng.normal(scale=0.2, size=3)
+        n /= np.linalg.norm(n)
+        ways.append((n, 1.2 * n + 0.3 * np.cross(n, [0.0, 0.6, 0.8])))
+    felt = sensed(scene, AT, ways)
+    assert isinstance(felt, hg.Grasp)
+    np.testing.assert_allclose(felt.q, AT, atol=1e-12)
+    for contact, center, (n, f) in zip(
+        felt.contacts, scene.articulated.centers(AT), ways, strict=True
+    ):
+        np.testing.assert_allclose(contact.normal, n, atol=1e-9)
+        np.testing.assert_allclose(contact.position, center - TIP * n, atol=1e-9)
+        np.testing.assert_allclose(contact.wrench[:3], f, atol=1e-9)
+        np.testing.assert_allclose(contact.wrench[3:], np.cross(-TIP * n, f), atol=1e-9)
+        assert contact.noise == 0.0
+
+
+@pytest.mark.parametrize(("slope", "clear"), [(1.45, True), (1.55, False)])
+def test_what_pushes_flatter_than_friction_holds_is_unclear(scene, slope, clear):
+    ways = [(LEFT, LEFT), (RIGHT, np.array([1.0, slope, 0.0]))]
+    felt = sensed(scene, AT, ways)
+    assert felt == hg.Missed(hg.Miss.UNCLEAR, "right finger") or clear
+    assert isinstance(felt, hg.Grasp) is clear
+
+
+@pytest.mark.parametrize(
+    ("up", "above", "met"), [(0.75, 1.5e-3, True), (0.65, 1.5e-3, False), (0.75, 2.5e-3, False)]
+)
+def test_what_faces_up_within_two_millimetres_of_the_table_is_the_table(scene, up, above, met):
+    n = np.array([-np.sqrt(1.0 - up**2), 0.0, up])
+    height = scene.articulated.centers(AT)[0, 2] - TIP * up - above
+    felt = sensed(scene, AT, [(n, n), (RIGHT, RIGHT)], table=height)
+    assert felt == hg.Missed(hg.Miss.TABLE, "left finger") if met else isinstance(felt, hg.Grasp)
+
+
+@pytest.mark.parametrize(("gap", "met"), [(1.9e-3, True), (2.1e-3, False)])
+def test_a_tip_within_two_millimetres_of_another_finger_touches_that(scene, gap, met):
+    angle = np.arcsin((APART - TIP - gap / 2.0) / LENGTH)
+    felt = sensed(scene, [0.2, angle, angle], [(LEFT, LEFT), (RIGHT, RIGHT)])
+    assert felt == hg.Missed(hg.Miss.OWN_LINK, "left finger") if met else isinstance(felt, hg.Grasp)
+
+
+@pytest.mark.parametrize(("sigma", "noticed"), [(0.005, 0.1), (0.05, 0.346), (8.0, 6.0)])
+def test_a_touch_is_four_times_the_noise_within_what_counts_and_what_may_be_held(
+    scene, sigma, noticed
+):
+    """Of one sample's length, that is √3 σ; a tenth of a newton at least, the hold at most."""
+    hand = Noting(scene, hg.Physics(imperfections=hg.Imperfections(force_noise=sigma)))
+    hand.place(CLOSED)
+    probe = hg.PhysicalProbe(hand, scene.articulated)
+    object.__setattr__(probe, "_close", lambda readings, noticed: hg.Missed(hg.Miss.NO_TOUCH, ""))
+    object.__setattr__(probe, "_retreat", lambda *_: None)
+    object.__setattr__(probe, "_go", lambda *_: "")
+    hand._errors._perfect = False
+    probe.touch(CLOSED)
+    forces = [call[4] for call in hand.calls if call[0] == "close"]
+    assert len(forces) > 0
+    np.testing.assert_allclose(forces, noticed, rtol=0.25)
