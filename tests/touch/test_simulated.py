@@ -536,13 +536,21 @@ def test_what_happens_first_in_a_move_is_what_stops_it(scene, bump, told, stands
     T = 100
     state, _ = hand._run(hand._plan(T))
     wrench = np.random.default_rng(0).normal(scale=1e-3, size=(T, 2, 6))
-    wrench[40:, 1] = wrench[40, 1]
+    wrench[40:45, 1] = wrench[40, 1]
+    wrench[70:74, 0] = wrench[70, 0]  # four are not enough
     if bump is not None:
         wrench[bump : bump + 2, 0, 2] = 2.0
         wrench[20, 0, 2] = 50.0  # a spike is nothing
+    spared = wrench.copy()
+    spared[44, 1] += 1e-3
     assert hand._react(state, wrench, np.zeros((T, 3))) == stands
     assert hand._fault == told
     np.testing.assert_array_equal(hand._state, state[stands - 1])
+    hand = high(scene)
+    hand.move(np.array([0.2, 0.3, 0.3]), 0.5)
+    hand._plan(T)
+    done = hand._react(state, spared, np.zeros((T, 3)))
+    assert (done, hand._fault == "") == ((100, True) if bump is None else (bump + 2, False))
 
 
 def test_two_sensors_dead_at_once_are_a_hand_that_feels_nothing_and_no_fault_of_one(scene):
