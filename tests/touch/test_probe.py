@@ -445,6 +445,33 @@ def tangents(normal):
     return one, np.cross(normal, one)
 
 
+@pytest.mark.parametrize(("apart", "touches"), [(0.0133, True), (0.0215, False)])
+def test_a_finger_that_would_pass_the_object_by_closes_to_it_where_it_is_near(
+    tmp_path, apart, touches
+):
+    """Its own way leads along x and y at once, the object stands in −y, within 2 cm or not."""
+    (tmp_path / "plotter.xml").write_text(
+        """<mujoco><worldbody><body name="palm"><geom type="sphere" size="0.001"/>
+        <body name="finger"><joint name="x" type="slide" axis="1 0 0" range="-0.1 0.1"/>
+        <joint name="y" type="slide" axis="0 1 0" range="-0.1 0.1"/>
+        <geom type="sphere" size="0.005"/></body></body></worldbody></mujoco>"""
+    )
+    (tmp_path / "plotter.toml").write_text(
+        """model = "plotter.xml"
+        palm = { body = "palm" }
+        contact_points = [{ link = "finger", flexion = { x = 1, y = 1 } }]"""
+    )
+    way = np.array([0.6, -0.8])
+    middle = (apart + 0.015) * way
+    scene = Scene(tmp_path / "plotter.toml", Cylinder(0.01), (*middle, 0.0))
+    felt = GeometricProbe(scene, links="pass").touch(np.zeros(2))
+    if not touches:
+        assert felt == Missed(Miss.NO_TOUCH, "finger")
+        return
+    np.testing.assert_allclose(felt.q, apart * way, atol=1e-6)
+    np.testing.assert_allclose(felt.normals, [[*-way, 0.0]], atol=1e-4)
+
+
 def test_a_ball_has_no_stretch(world):
     for grasp in world.grasps:
         assert grasp.rolling is None

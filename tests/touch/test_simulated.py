@@ -83,8 +83,9 @@ def high(scene, **about):
 def go(hand, q, duration=0.3):
     """Move there, and a little on; what was read at last."""
     left = hand.move(np.asarray(q, dtype=float), duration) + 0.3
+    slice_ = 0.4 * hand.limits.watchdog
     while left > 0.0:
-        read, left = hand.wait(0.4), left - 0.4
+        read, left = hand.wait(slice_), left - slice_
     return read
 
 
@@ -727,3 +728,93 @@ def test_a_touch_is_four_times_the_noise_within_what_counts_and_what_may_be_held
     forces = [call[4] for call in hand.calls if call[0] == "close"]
     assert len(forces) > 0
     np.testing.assert_allclose(forces, noticed, rtol=0.25)
+
+
+# ---------------------------------------------------------------- how fast, and how long
+
+
+def pressing(scene, torque):
+    """A hand that has touched, and is told to press."""
+    hand = hg.SimulatedHand(scene)
+    hand.place(CLOSED)
+    assert isinstance(hg.PhysicalProbe(hand, scene.articulated).touch(CLOSED), hg.Grasp)
+    hand.press(np.array([0.0, torque, torque]))
+    return hand
+
+
+def test_pressed_joints_gain_two_newton_metres_a_second(scene):
+    hand = pressing(scene, 1.2)
+    read = hand.wait(0.4)
+    assert read.fault == ""
+    for j in (1, 2):
+        slope = np.polyfit(read.time[10:], read.torque[10:, j], 1)[0]
+        assert slope == pytest.approx(2.0, rel=0.1)
+    np.testing.assert_allclose(hand.wait(0.4).torque[-1, 1:], 1.2, atol=0.1)
+    np.testing.assert_allclose(np.abs(hand.truth().forces[:, 0]), 1.2 / LENGTH, rtol=0.1)
+
+
+def test_a_joint_that_meets_nothing_stops_the_hand_after_three_tenths_of_a_second(scene):
+    """And the time that half of its torque takes to be there."""
+    hand = high(scene)
+    hand.press(np.array([0.0, 0.4, 0.0]))
+    begun = hand._state[0]
+    while not (read := hand.wait(0.01)).fault:
+        assert read.time[-1] - begun < 1.0
+    assert read.fault == "left meets nothing that resists what it presses with"
+    assert hand._asked is None
+    assert read.time[-1] - begun == pytest.approx(0.3 + 0.2 / 2.0, abs=0.06)
+
+
+def test_closing_gains_twenty_radians_a_second_squared(scene):
+    hand = hg.SimulatedHand(scene)
+    hand.place(CLOSED)
+    hand.close(1, 0.5, 0.8)
+    hand._plan(40)
+    goal, speed, _ = hand._planned
+    expected = np.minimum(0.5, 20.0 * 0.002 * np.arange(1, 41))
+    np.testing.assert_allclose(speed, np.outer(expected, [0.0, 0.0, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(goal[:, 2] - hand._goal[2], 0.002 * expected.cumsum(), atol=1e-12)
+    np.testing.assert_array_equal(goal[:, :2], np.tile(hand._goal[:2], (40, 1)))
+
+
+@pytest.mark.parametrize(("after", "stalled"), [(0.04, False), (0.06, True)])
+def test_a_closing_joint_is_stalled_once_it_is_a_hundredth_of_a_radian_behind(
+    scene, after, stalled
+):
+    """0.015 rad at 0.4 rad/s, which are there after 0.02 s."""
+    about = hg.Imperfections(faults=(hg.world.imperfections.Fault("stall", 0, 0.1),))
+    hand = hg.SimulatedHand(scene, hg.Physics(imperfections=about))
+    hand.place(CLOSED)
+    hand.wait(0.3)
+    hand.close(0, 0.4, 0.8)
+    assert hand.wait(after).stalled[0] == stalled
+
+
+def test_a_finger_closes_against_the_middle_of_what_its_tip_felt_lately(scene):
+    hand = high(scene)
+    lately = np.zeros((25, 2, 6))
+    lately[:, 1, :3] = np.linspace(0.0, 1.0, 25)[:, None] ** 2
+    lately[3, 1, :3] = 90.0  # a spike
+    hand._last = lately
+    hand.close(1, 0.5, 0.5)
+    np.testing.assert_allclose(hand._zero[1], (13 / 24) ** 2)
+    assert (hand._zero[0] == 0.0).all()
+    hand.wait(0.2)
+    assert len(hand._last) == 25  # 0.05 s
+
+
+def test_a_silent_caller_stops_a_hand_that_moves_closes_or_presses_after_the_watchdogs_time(scene):
+    for begin in ("move", "close"):
+        hand = high(scene, watchdog=0.3)
+        begun = hand._state[0]
+        if begin == "move":
+            hand.move(np.array([0.2, 0.5, 0.5]), 1.0)
+        else:
+            hand.close(0, 0.5, 0.5)
+        read = hand.wait(0.7)
+        assert read.fault == "watchdog: no call for 0.3 s"
+        still = read.time[np.abs(read.velocity[:, 1]) > 0.05]
+        assert 0.25 < still.max() - begun < 0.45
+    assert hand.wait(0.5).fault == read.fault  # until it is moved again
+    hand = high(scene, watchdog=0.3)
+    assert hand.wait(0.7).fault == ""  # it stood
