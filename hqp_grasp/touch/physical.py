@@ -311,7 +311,7 @@ class PhysicalProbe:
                 gap = mujoco.mj_geomDistance(robot.model, self._data, tip, link, NEAR, None)
                 if gap < NEAR:
                     return Missed(Miss.OWN_LINK, name)
-        R_world_tip = robot.tip_frames(q).copy()
+        R_world_tip = robot.tip_frames(q)
         wrench = self._steady(held) - self._steady(free)
         unsure = self._unsure(held) + self._unsure(free)
         wrench -= weight(self._payload, R_world_tip)

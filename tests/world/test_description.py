@@ -1508,3 +1508,10 @@ def test_jaws_amid_their_palm_approach_across_the_plane_they_close_in(tmp_path):
     np.testing.assert_allclose(p, [0, 0, 0.2], atol=1e-12)
     normal = np.array([0, -np.sin(0.5), np.cos(0.5)])
     assert abs(R[:, 2] @ normal) == pytest.approx(1.0)
+
+
+def test_a_locked_joint_stands_within_a_range_of_degrees(tmp_path):
+    xml = as_degrees(XML[: XML.index("  <equality>")] + "</mujoco>")
+    xml = change(xml, 'range="0 1', 'range="20 1')
+    robot = written(tmp_path, xml, 'lock = ["proximal"]\n' + SHORT)
+    np.testing.assert_allclose(robot.offset, [0.0, np.radians(20.0), 0.0], atol=1e-9)

@@ -119,6 +119,15 @@ def test_a_foot_is_the_lowest_and_narrowest_of_what_is_felt_as_it_is_turned(tilt
     assert width == pytest.approx(min(high[0] - low[0], high[1] - low[1]) / 2)
 
 
+def test_a_foot_of_a_mesh_is_that_of_its_corners_wherever_its_own_frame_is():
+    corners = ((0.05, -0.01), (0.02, 0.03), (-0.02, 0.02), (-0.01, -0.03))
+    scene = hg.Scene("bhand", hg.Prism(corners, 0.2), (0.1, 0.2, 0.5), hand_above())
+    bottom, width = foot(scene)
+    # Its box is along its own axes, and may be a little wider than the corners are.
+    assert bottom == pytest.approx(0.4, abs=1e-6)
+    assert 0.03 - 1e-6 <= width < 0.04
+
+
 @pytest.mark.parametrize("support", ["pedestal", "table"])
 def test_a_support_is_below_the_object_and_carries_it(tilted, support):
     model = simulated_model(tilted, hg.Physics(support=support, mass=0.37))
@@ -254,3 +263,20 @@ def test_braked_links_stand_turned_as_home_has_them(tmp_path):
     for b in range(model.nbody):
         np.testing.assert_allclose(data.xpos[b], there.body(model.body(b).name).xpos, atol=1e-9)
         np.testing.assert_allclose(data.xmat[b], there.body(model.body(b).name).xmat, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "many"),
+    [
+        ('joint="finger" kp="1" forcerange="-1 1"', 'joint="finger" kp="1"', 0),
+        ('<position joint="finger" kp="1"', '<motor joint="finger" gear="1"', 0),
+        ("<actuator>", '<actuator><position joint="finger" kp="2" forcerange="-1 1"/>', 2),
+    ],
+)
+def test_a_joint_has_one_servo_with_a_limit_or_is_refused(old, new, many):
+    assert IDLE.count(old) == 1
+    model = mujoco.MjModel.from_xml_string(IDLE.replace(old, new))
+    with pytest.raises(hg.ModelError, match=f"'finger' needs one position .*; it has {many}"):
+        servos(model, ("still", "finger"))
+    plain = mujoco.MjModel.from_xml_string(IDLE)
+    np.testing.assert_array_equal(servos(plain, ("still", "finger")), [1, 0])
