@@ -119,13 +119,14 @@ def test_a_foot_is_the_lowest_and_narrowest_of_what_is_felt_as_it_is_turned(tilt
     assert width == pytest.approx(min(high[0] - low[0], high[1] - low[1]) / 2)
 
 
-def test_a_foot_of_a_mesh_is_that_of_its_corners_wherever_its_own_frame_is():
-    corners = ((0.05, -0.01), (0.02, 0.03), (-0.02, 0.02), (-0.01, -0.03))
-    scene = hg.Scene("bhand", hg.Prism(corners, 0.2), (0.1, 0.2, 0.5), hand_above())
-    bottom, width = foot(scene)
-    # Its box is along its own axes, and may be a little wider than the corners are.
-    assert bottom == pytest.approx(0.4, abs=1e-6)
-    assert 0.03 - 1e-6 <= width < 0.04
+def test_a_foot_of_a_mesh_is_that_of_its_corners_wherever_its_own_frame_is(tmp_path):
+    """MuJoCo keeps a flat pyramid in a frame of its own: about its centroid, z along x."""
+    corners = ((0.06, 0.04, 0), (-0.06, 0.04, 0), (-0.06, -0.04, 0), (0.06, -0.04, 0), (0, 0, 0.04))
+    faces = ((1, 3, 2), (1, 4, 3), (1, 2, 5), (2, 3, 5), (3, 4, 5), (4, 1, 5))
+    lines = ["v {} {} {}".format(*c) for c in corners] + ["f {} {} {}".format(*f) for f in faces]
+    (tmp_path / "pyramid.obj").write_text("\n".join(lines) + "\n")
+    scene = hg.Scene("bhand", hg.Body(tmp_path / "pyramid.obj"), (0.1, 0.2, 0.5), hand_above())
+    np.testing.assert_allclose(foot(scene), (0.48, 0.04), atol=1e-6)
 
 
 @pytest.mark.parametrize("support", ["pedestal", "table"])
