@@ -2,6 +2,7 @@
 
 PYTHON ?=            # builds .venv; left empty, the first on the path that is new enough
 PYTEST_ARGS ?= -n 2  # tests in two processes; left empty, in one
+SEED ?= 1            # draws the mutants
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -42,7 +43,7 @@ help:
 	@echo 'make pictures   draw the laws and the grasp on the front page into docs/ (needs chromium)'
 	@echo 'make bench   compare with peers, print ratios'
 	@echo 'make outside   grasp with robots, and objects, that nobody here made; 1 GB of packages (an hour)'
-	@echo 'make mutants   spoil the code in 28 places, see whether tests notice (an hour)'
+	@echo 'make mutants   spoil 60 lines drawn by SEED=1, see whether tests notice (an hour)'
 	@echo 'make results   run all that README and docs quote, into out/results, docs/images and docs/data (hours)'
 	@echo 'make clean   remove what these made, except results in out/'
 	@echo 'Each installs what it needs into .venv first; PYTHON=python3.12 chooses the Python.'
@@ -82,7 +83,7 @@ outside: $(READY_OUTSIDE)
 	$(PY) benchmarks/leaning.py --starts 20 --seed 71 --outside
 
 mutants: $(READY_DEV)
-	$(PY) benchmarks/mutants.py
+	$(PY) benchmarks/mutants.py --seed $(SEED)
 
 # Every command whose figures README.md and docs/ quote. What each prints goes into $(RESULTS), pictures
 # into docs/images/, their data into docs/data/. tests/test_packaging.py knows if docs quote a command that is not here.

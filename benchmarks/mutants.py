@@ -1,157 +1,297 @@
-"""Spoil the code in one place at a time, and see whether the tests notice: `make mutants`."""
+"""Spoil the code in one line at a time, drawn by a seed, and see whether the tests notice.
+
+`make mutants SEED=1` draws 60. Neither well-kept tool draws them: cosmic-ray has one test command
+for all mutants and no sample; mutmut 3 knows which tests reach a function, but mutates neither
+decorated functions (our compiled kernels) nor constants of a module, and has no seed. What is
+here instead: edits by the syntax tree, and pytest-cov to know which tests reach a line.
+"""
 
 from __future__ import annotations
 
 import ast
+import hashlib
+import json
 import os
+import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
 
 ROOT = Path(__file__).parents[1]
 TREE = ("hqp_grasp", "robots", "scenarios", "tests", "docs", "benchmarks")  # what tests read
-FILES = ("pyproject.toml", "README.md", "CONTRIBUTING.md", "Makefile")
-LONGEST = 900  # [s] a run of the tests may take; one that hangs has noticed
+FILES = ("pyproject.toml", "README.md", "CONTRIBUTING.md", "Makefile", "mkdocs.yml")
+SLACK = 120.0  # [s] for imports and compiling, beside 4 × the time that the tests take
+LONGEST = 1800.0  # [s] for all tests
+
+SWAPPED = {
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.Lt: ("<", "<=", ">"),
+    ast.LtE: ("<=", "<", ">="),
+    ast.Gt: (">", ">=", "<"),
+    ast.GtE: (">=", ">", "<="),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+    ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"),
+    ast.NotIn: ("not in", "in"),
+}
+CALLS = {"min": "max", "minimum": "maximum", "argmin": "argmax", "sin": "cos", "any": "all"}
+CALLS |= {new: old for old, new in CALLS.items()} | {"floor": "ceil", "ceil": "floor"}
+# What only shows: how a figure looks, what a message says; `strict` guards lengths that agree.
+LOOKS = {
+    "repr",
+    "strict",
+    "figsize",
+    "linewidth",
+    "lw",
+    "alpha",
+    "color",
+    "fontsize",
+    "dpi",
+    "width",
+    "precision",
+}
+TALKS = {"print", "warn", "write", "format", "add_argument", "set_title", "legend", "text"}
+ATOMS = (ast.Name, ast.Attribute, ast.Call, ast.Subscript, ast.Constant)
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One edit: within the symbol `place`, the one occurrence of `old` becomes `new`.
+    """One edit: bytes begin:end of a module's source become `new`."""
 
-    `place` is "folder/file.py:name", a function, a class, a constant, or "Class.method" of
-    hqp_grasp. `tests` are the folders or files of tests/ to try first; the others follow.
-    """
-
-    place: str
-    old: str
+    module: str  # path from the root of the repository
+    line: int  # from 1
+    begin: int
+    end: int
     new: str
-    tests: str
-
-    @property
-    def path(self) -> Path:
-        return Path("hqp_grasp") / self.place.split(":")[0]
+    kind: str
+    first: int  # the statement's lines, by which tests are found …
+    last: int
+    hidden: bool  # … unless coverage cannot see them: compiled, or run by the import
 
     def applied(self, source: str) -> str:
-        """The edited source; ValueError where the symbol, or `old` in it, is not found once."""
-        name = self.place.split(":")[1]
-        begin, end = lines_of(source, name)
-        lines = source.splitlines(keepends=True)
-        symbol = "".join(lines[begin:end])
-        if symbol.count(self.old) != 1:
-            raise ValueError(f"{self.place} holds {self.old!r} {symbol.count(self.old)} times")
-        edited = symbol.replace(self.old, self.new)
-        return "".join([*lines[:begin], edited, *lines[end:]])
+        """The edited source."""
+        data = source.encode()
+        return (data[: self.begin] + self.new.encode() + data[self.end :]).decode()
+
+    def told(self, source: str) -> str:
+        """The line before → after."""
+        lines = (
+            text.splitlines()[self.line - 1].strip() for text in (source, self.applied(source))
+        )
+        return " → ".join(lines)
 
 
-TRIAL, STUDY, SCENE = (f"experiments/test_{name}.py" for name in ("trial", "study", "scenario"))
-PARTS = "experiments/test_parts.py"
-PRINTS = "experiments/test_fingerprint.py"
+def mutants_of(source: str, module: str) -> list[Mutant]:
+    """All one-line edits of a module, as the tree tells them; `differs` knows if one is Python."""
+    data = source.encode()
+    starts = [0]
+    for text in data.splitlines(keepends=True):
+        starts.append(starts[-1] + len(text))
+    found: dict[tuple[int, int, str], Mutant] = {}
 
-MUTANTS = (
-    # The gap between hierarchy and projection is the smallest difference instead of the largest.
-    Mutant("control/forms.py:_hierarchy", "unlimited).max())", "unlimited).min())", "control"),
-    # A clipped step is not scaled to its caps first.
-    Mutant(
-        "control/forms.py:clip_to_limits", "x / max(1.0, cap_ratio(x, stack, grasp))", "x", TRIAL
-    ),
-    # A warm start is not used.
-    Mutant("hierarchy/hqp.py:HQP._ways", "warm is not None and", "False and", "hierarchy"),
-    # Trials count as converged before a relapse.
-    Mutant("experiments/scenario.py:summary", "stays.argmax(", "good.argmax(", SCENE),
-    # Axes are swapped.
-    Mutant(
-        "experiments/plots.py:convergence_figure",
-        "right.plot(adduction[:, 0], elevation[:, 0]",
-        "right.plot(elevation[:, 0], adduction[:, 0]",
-        SCENE,
-    ),
-    # The moment is drawn as the angle.
-    Mutant("experiments/plots.py:convergence_figure", "middle, angle", "middle, moment", SCENE),
-    # What mink's limits hold is not told.
-    Mutant(
-        "experiments/fingerprint.py:Fingerprint._held", "if not k.starts", "if k.starts", PRINTS
-    ),
-    # Links count only deep in the object.
-    Mutant("touch/geometric.py:OVERLAP", "1e-7", "1e-3", "touch"),
-    # Workers have all the threads that they like.
-    Mutant("experiments/executor.py:_in_processes", "_one_blas_thread()", "ExitStack()", STUDY),
-    Mutant("control/forms.py:TOUCH_RANK", "1e-6", "1e-9", "control"),
-    Mutant("control/landing.py:LANDING_STEPS", "3", "1", "control"),
-    Mutant("control/landing.py:LANDING_DAMPING", "1e-2", "1e-1", "control"),
-    Mutant("touch/geometric.py:RETREAT", "0.35", "0.15", "touch"),
-    # RIDGE and MET are gone: an uncertified answer is returned; lower laws disturb higher ones.
-    Mutant("hierarchy/hqp.py:HQP.solve", "if not judged.faults:", "if True:", "hierarchy"),
-    Mutant("hierarchy/projection.py:Projection.solve", "Vt[rank:].T", "Vt.T", "hierarchy"),
-    # Up to here the 15 that survived once; from here 13 more. A slide is taken for a hinge.
-    Mutant("world/robot.py:Robot.hessian", " * self._hinge[:, None]", "", "world"),
-    # A coupling's constant is ignored.
-    Mutant("world/robot.py:_couplings", "at_zero + coefficients[0]", "at_zero", "world"),
-    # Motion and rotation change places.
-    Mutant("world/robot.py:Robot.palm_jacobian", "J[:3], J[3:]", "J[3:], J[:3]", "world"),
-    # The model does not count in a fingerprint.
-    Mutant(
-        "experiments/fingerprint.py:Fingerprint._describe",
-        "buffer.tobytes()",
-        'b""',
-        PRINTS,
-    ),
-    # The centroid stays while contacts move.
-    Mutant("tasks/moment.py:MomentTask.contact_jacobian", "f / grasp.k", "0.0 * f", "tasks"),
-    # Clearances come before caps.
-    Mutant("tasks/stack.py:Stack.limit_levels", "self.limits})", "self.limits})[::-1]", "tasks"),
-    # The sign of a Jacobian.
-    Mutant("tasks/kinematic.py:_turn", "np.copysign(1.0, cosine)", "np.ones_like(cosine)", "tasks"),
-    # Limits in the order given instead of their own.
-    Mutant("control/ik.py:ik_levels", "sorted(limits, key=_priority)", "limits", "control"),
-    # The moment's step disturbs the force.
-    Mutant(
-        "control/paper.py:contact_step", "_nullspace(above)", "_nullspace(0 * above)", "control"
-    ),
-    # A tip stops a thousandth of a millimetre off the surface.
-    Mutant("touch/geometric.py:TOUCH", "1e-9", "1e-6", "touch"),
-    # Trials of one number are alike in every study.
-    Mutant(
-        "experiments/trial.py:Trial.begin", "Sequence(entropy)", "Sequence(entropy[-1:])", TRIAL
-    ),
-    # A killed run leaves half a file.
-    Mutant(
-        "experiments/parts.py:_write", 'path.with_suffix(f".{os.getpid()}.part")', "path", PARTS
-    ),
-    # A damped level forgets those above it.
-    Mutant("hierarchy/hqp.py:HQP.damped", "[*held, Level(", "[Level(", "hierarchy"),
-)
+    def span(node: ast.expr) -> tuple[int, int]:
+        assert node.end_lineno is not None and node.end_col_offset is not None
+        begin = starts[node.lineno - 1] + node.col_offset
+        return begin, starts[node.end_lineno - 1] + node.end_col_offset
+
+    def text(node: ast.expr) -> str:
+        begin, end = span(node)
+        kept = data[begin:end].decode()
+        return kept if isinstance(node, ATOMS) else f"({kept})"
+
+    def edits(node: ast.AST, index: bool) -> Iterator[tuple[str, int, int, str]]:
+        """(kind, begin, end, new); `index` where the node stands in brackets or is an axis."""
+        if isinstance(node, ast.BinOp | ast.BoolOp):
+            sides = [node.left, node.right] if isinstance(node, ast.BinOp) else node.values
+            yield from operator(node.op, sides[0], sides[1])
+            if isinstance(node, ast.BoolOp) or isinstance(node.op, ast.Add | ast.Sub):
+                for kept in sides:
+                    yield ("dropped term", *span(node), text(kept))
+        elif isinstance(node, ast.Compare) and len(node.ops) == 1:
+            yield from operator(node.ops[0], node.left, node.comparators[0])
+        elif isinstance(node, ast.AugAssign):
+            yield from operator(node.op, node.target, node.value)
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+            if index and isinstance(node.operand, ast.Constant):
+                yield ("index", *span(node), "0")
+            else:
+                yield ("sign", *span(node), text(node.operand))
+        elif isinstance(node, ast.Constant):
+            yield from constant(node, index)
+        elif isinstance(node, ast.Call):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            if name in CALLS:
+                end = span(node.func)[1]
+                yield "call", end - len(name), end, CALLS[name]
+            starred = any(isinstance(each, ast.Starred) for each in node.args[:2])
+            if len(node.args) > 1 and name != "isinstance" and not starred:
+                (begin, left), (right, end) = span(node.args[0]), span(node.args[1])
+                turned = data[right:end] + data[left:right] + data[begin:left]
+                yield "order", begin, end, turned.decode()
+
+    def operator(
+        op: ast.AST, left: ast.expr, right: ast.expr
+    ) -> Iterator[tuple[str, int, int, str]]:
+        if type(op) not in SWAPPED:
+            return
+        old, *others = SWAPPED[type(op)]
+        begin, end = span(left)[1], span(right)[0]
+        between = data[begin:end].decode()
+        if between.count(old) == 1:
+            at = begin + len(between[: between.index(old)].encode())
+            kind = "comparison" if isinstance(op, ast.cmpop) else "operator"
+            for new in others:
+                yield kind, at, at + len(old), new
+
+    def constant(node: ast.Constant, index: bool) -> Iterator[tuple[str, int, int, str]]:
+        value = node.value
+        if isinstance(value, bool):
+            yield ("bool", *span(node), str(not value))
+        elif index and isinstance(value, int):
+            yield ("index", *span(node), {0: "1", 1: "0"}.get(value, str(value - 1)))
+            if value == 0:
+                yield ("index", *span(node), "-1")
+        elif isinstance(value, int | float):
+            yield ("constant", *span(node), repr(3 * value) if value else "1")
+
+    def visit(node: ast.AST, place: tuple[int, int, bool], index: bool) -> None:
+        if cosmetic(node):
+            return
+        if isinstance(node, ast.FunctionDef):
+            compiled = any("jit" in ast.unparse(each) for each in node.decorator_list)
+            for statement in node.body:
+                visit(statement, (0, 0, compiled), False)
+            for default in [*node.args.defaults, *filter(None, node.args.kw_defaults)]:
+                visit(default, (node.lineno, node.lineno, True), False)
+            return
+        if isinstance(node, ast.ClassDef):
+            for statement in node.body:
+                visit(statement, (0, 0, True), False)
+            return
+        if isinstance(node, ast.stmt):
+            last = node.body[0].lineno - 1 if hasattr(node, "body") else node.end_lineno
+            place = (node.lineno, max(node.lineno, last or 0), place[2])
+        for kind, begin, end, new in edits(node, index):
+            if b"\n" not in data[begin:end] and "\n" not in new:
+                line = data[:begin].count(b"\n") + 1
+                mutant = Mutant(module, line, begin, end, new, kind, *place)
+                found.setdefault((begin, end, new), mutant)
+        if index and isinstance(node, ast.UnaryOp):  # −1 is one number here
+            return
+        for name, value in ast.iter_fields(node):
+            if name in ("annotation", "returns", "decorator_list"):
+                continue
+            inside = name == "slice" or (index and isinstance(node, ast.Tuple | ast.Slice))
+            inside |= isinstance(node, ast.keyword) and node.arg == "axis"
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    visit(child, place, inside)
+
+    tree = ast.parse(source)
+    visit(tree, (0, 0, True), False)
+    return list(found.values())
 
 
-def lines_of(source: str, name: str) -> tuple[int, int]:
-    """The lines begin:end of a symbol, decorators aside."""
-    node: ast.AST = ast.parse(source)
-    for part in name.split("."):
-        inside = [n for n in ast.iter_child_nodes(node) if part in names_of(n)]
-        if len(inside) != 1:
-            raise ValueError(f"{name} is defined {len(inside)} times")
-        node = inside[0]
-    assert isinstance(node, ast.stmt) and node.end_lineno is not None
-    return node.lineno - 1, node.end_lineno
+def differs(mutant: Mutant, source: str) -> bool:
+    """Whether the edit is Python, and other than what was there."""
+    try:
+        return ast.dump(ast.parse(mutant.applied(source))) != ast.dump(ast.parse(source))
+    except SyntaxError:
+        return False
 
 
-def names_of(node: ast.AST) -> list[str]:
-    """What a statement defines."""
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        return [node.name]
-    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-    return [target.id for target in targets if isinstance(target, ast.Name)]
+def cosmetic(node: ast.AST) -> bool:
+    """What no test should hold: messages, looks, types, and f-strings, whose places 3.11 lacks."""
+    if isinstance(node, ast.JoinedStr | ast.Raise | ast.Import | ast.ImportFrom):
+        return True
+    if isinstance(node, ast.FunctionDef):
+        return node.name in ("__repr__", "__str__")
+    if isinstance(node, ast.If):
+        return "TYPE_CHECKING" in ast.unparse(node.test)
+    if isinstance(node, ast.keyword):
+        return node.arg in LOOKS
+    if isinstance(node, ast.Call):
+        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        return name in TALKS or name.endswith(("Error", "Warning"))
+    return False
+
+
+def drawn(sources: dict[str, str], count: int, seed: int) -> list[Mutant]:
+    """`count` mutants, from each module in turn; there, each kind of edit is as likely."""
+    rng = random.Random(seed)
+    modules = sorted(sources)
+    rng.shuffle(modules)
+    left: dict[str, list[Mutant]] = {}
+    chosen: list[Mutant] = []
+    while len(chosen) < count and modules:
+        for module in list(modules):
+            if module not in left:
+                left[module] = mutants_of(sources[module], module)
+            if not left[module]:
+                modules.remove(module)
+            elif len(chosen) < count:
+                kind = rng.choice(sorted({each.kind for each in left[module]}))
+                mutant = rng.choice([each for each in left[module] if each.kind == kind])
+                left[module].remove(mutant)
+                while not differs(mutant, sources[module]) and left[module]:
+                    mutant = left[module].pop(rng.randrange(len(left[module])))
+                if differs(mutant, sources[module]):
+                    chosen.append(mutant)
+    return chosen
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Which tests run which lines, and how long each takes."""
+
+    seconds: dict[str, float]  # of each test that passes
+    lines: dict[str, dict[str, list[str]]]  # module, line, tests
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """The tests that reach the line, file by file, the quickest first; all where unknown."""
+        lines = self.lines.get(mutant.module, {})
+        if mutant.hidden:
+            hit = {test for tests in lines.values() for test in tests}
+        else:
+            wanted = range(mutant.first, mutant.last + 1)
+            hit = {test for line in wanted for test in lines.get(str(line), [])}
+        hit &= set(self.seconds)
+        folder = mutant.module.replace("hqp_grasp", "tests", 1).rpartition("/")[0]
+        rest = set(self.seconds) - hit if mutant.hidden or not hit else set()
+        files: dict[str, float] = {}
+        for test in hit:
+            name = test.split("::")[0]
+            files[name] = files.get(name, 0.0) + self.seconds[test]
+
+        def turn(test: str) -> tuple:
+            name = test.split("::")[0]
+            near = mutant.hidden and name.rpartition("/")[0] != folder
+            return test in rest, near, files.get(name, 0.0), name, self.seconds[test]
+
+        return sorted(hit | rest, key=turn)
 
 
 def copied(folder: Path) -> Path:
-    """A copy of the tree in `folder`, with what numba has compiled."""
+    """A copy of the tree in `folder`, with what Python and numba have compiled."""
     for name in TREE:
         shutil.copytree(ROOT / name, folder / name)
     for name in FILES:
@@ -159,70 +299,150 @@ def copied(folder: Path) -> Path:
     return folder
 
 
-def failure(tree: Path, tests: str) -> str:
-    """The first test that fails in `tree`, those of `tests` tried first; empty where none does."""
-    folders = [*(f"tests/{name}" for name in tests.split()), "tests"]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *folders]
-    environment = os.environ | {"PYTHONPATH": str(tree)}
-    try:
-        done = subprocess.run(
-            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=LONGEST
-        )
-    except subprocess.TimeoutExpired:
-        return f"longer than {LONGEST} s"
-    if done.returncode == 0:
-        return ""
-    failed = re.findall(r"^(?:FAILED|ERROR) tests/(.*?)(?: - .*)?$", done.stdout, re.MULTILINE)
-    if not failed:
-        raise RuntimeError(f"pytest did not run:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
-    return str(failed[0])
+def pytest(tree: Path, arguments: list[str], longest: float) -> tuple[int | None, str]:
+    """pytest's exit code and what it says; None where it takes longer than `longest` [s]."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *arguments]
+    environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command,
+        cwd=tree,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as running:
+        try:
+            said, _ = running.communicate(timeout=longest)
+        except subprocess.TimeoutExpired:
+            os.killpg(running.pid, signal.SIGKILL)
+            return None, ""
+        return running.returncode, said
 
 
-def judge(mutant: Mutant) -> str:
+def reach(out: Path) -> Reach:
+    """Read from `out`, or measured by one run of all tests; kept for this state of the tree."""
+    digest = hashlib.sha256()
+    for path in sorted(p for n in ("hqp_grasp", "tests") for p in (ROOT / n).rglob("*.py")):
+        digest.update(str(path.relative_to(ROOT)).encode() + path.read_bytes())
+    kept = out / f"reach-{digest.hexdigest()[:12]}.json"
+    if not kept.exists():
+        from coverage import CoverageData  # here, so that the drawer's tests do without
+
+        print("running all tests once, to know which lines each reaches", flush=True)
+        with tempfile.TemporaryDirectory() as folder:
+            tree = copied(Path(folder).resolve())
+            cover = ["--cov=hqp_grasp", "--cov-context=test", "--cov-report="]
+            code, said = pytest(tree, ["-n", "2", "--junitxml=times.xml", *cover], LONGEST)
+            if code not in (0, 1):
+                sys.exit(f"pytest did not run:\n{said[-3000:]}")
+            seconds = {}
+            for case in ElementTree.parse(tree / "times.xml").iter("testcase"):
+                name = f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
+                if not len(case):  # neither failed nor skipped
+                    seconds[name] = float(case.get("time", 0.0))
+            if code:
+                print("fail without any mutant, and are left out:", *failures(said), sep="\n  ")
+            data = CoverageData(str(tree / ".coverage"))
+            data.read()
+            lines = {
+                str(Path(name).relative_to(tree)): {
+                    str(line): sorted({c.rpartition("|")[0] for c in contexts if c})
+                    for line, contexts in data.contexts_by_lineno(name).items()
+                }
+                for name in data.measured_files()
+            }
+        out.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps({"seconds": seconds, "lines": lines}), encoding="utf-8")
+    return Reach(**json.loads(kept.read_text(encoding="utf-8")))
+
+
+def failures(said: str) -> list[str]:
+    """The tests that pytest's summary calls failed."""
+    return re.findall(r"^(?:FAILED|ERROR) (tests/.*?)(?: - .*)?$", said, re.MULTILINE)
+
+
+def forget_compiled(tree: Path, module: str) -> None:
+    """Remove kernels that may hold old code: those of `module` and of all that import from it."""
+    stale = [module]
+    sources = {p: p.read_text(encoding="utf-8") for p in (tree / "hqp_grasp").rglob("*.py")}
+    for name in stale:  # grows while it is read
+        dotted = name.removesuffix(".py").replace("/", ".")
+        parent, _, last = dotted.rpartition(".")
+        imported = rf"^from ({re.escape(dotted)} import|{re.escape(parent)} import.*\b{last}\b)"
+        for path, source in sources.items():
+            relative = str(path.relative_to(tree))
+            if relative not in stale and re.search(imported, source, re.MULTILINE):
+                stale.append(relative)
+    for name in stale:
+        path = tree / name
+        for kept in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb[ci]"):
+            kept.unlink()
+
+
+def judge(mutant: Mutant, known: Reach) -> str:
     """The test that notices the mutant; empty where none does."""
+    tests = known.tests(mutant)
     with tempfile.TemporaryDirectory() as folder:
         tree = copied(Path(folder))
-        path = tree / mutant.path
-        source = path.read_text(encoding="utf-8")
-        path.write_text(mutant.applied(source), encoding="utf-8")
-        if "numba" in source:  # what is compiled may hold the old constants
-            for kept in (tree / "hqp_grasp").rglob("*.nb[ci]"):
-                kept.unlink()
-        return failure(tree, mutant.tests)
+        path = tree / mutant.module
+        path.write_text(mutant.applied(path.read_text(encoding="utf-8")), encoding="utf-8")
+        forget_compiled(tree, mutant.module)
+        (tree / "chosen.txt").write_text("\n".join(tests), encoding="utf-8")
+        longest = SLACK + 4.0 * sum(known.seconds[test] for test in tests)
+        code, said = pytest(tree, ["-x", "@chosen.txt"], longest)
+    if code is None:
+        return f"longer than {longest:.0f} s"
+    if code == 0:
+        return ""
+    failed = failures(said)
+    if code in (1, 2) and failed:
+        return failed[0]
+    raise RuntimeError(f"pytest did not run:\n{said[-3000:]}")
 
 
-def main(only: str = "", jobs: int = 2, survivors: int = 2) -> None:
-    """Try every mutant; exit with an error where more than `survivors` live.
+def main(
+    seed: int,
+    count: int = 60,
+    under: tuple[str, ...] = (),
+    jobs: int = 2,
+    dry: bool = False,
+    out: Path = ROOT / "out" / "mutants",
+) -> None:
+    """Try mutants; exit with an error where fewer than nine of ten are killed.
 
     Args:
-        only: Try those whose place or edit holds this text.
+        seed: Draws the mutants.
+        count: How many.
+        under: Folders or files of hqp_grasp to draw from, as `control tasks/moment.py`; else all.
         jobs: Mutants tried at a time.
-        survivors: How many may live.
+        dry: Draw and print them only.
+        out: Where results go.
     """
-    chosen = [m for m in MUTANTS if only in f"{m.place} {m.old} → {m.new}"]
-    stale = []
-    for mutant in chosen:  # all of them before any test is run
-        try:
-            mutant.applied((ROOT / mutant.path).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            stale.append(f"{mutant.place}: {error}")
-    if stale:
-        sys.exit("point these mutants to where the code is now:\n" + "\n".join(stale))
-    with tempfile.TemporaryDirectory() as folder:
-        broken = failure(copied(Path(folder)), "")
-    if broken:
-        sys.exit(f"the tests fail without any mutant: {broken}")
+    places = [ROOT / "hqp_grasp" / name for name in under] or [ROOT / "hqp_grasp"]
+    if missing := [str(place) for place in places if not place.exists()]:
+        sys.exit(f"there is no {', '.join(missing)}")
+    paths = {p for place in places for p in ([place] if place.is_file() else place.rglob("*.py"))}
+    sources = {str(p.relative_to(ROOT)): p.read_text(encoding="utf-8") for p in paths}
+    chosen = drawn(sources, count, seed)
+    told = [f"{m.module}:{m.line}: {m.told(sources[m.module])}" for m in chosen]
+    if dry:
+        return print(*told, sep="\n")
+    known = reach(out)
     begin = time.monotonic()
-    alive = 0
+    rows = []
     with ThreadPoolExecutor(jobs) as pool:
-        for mutant, noticed in zip(chosen, pool.map(judge, chosen), strict=True):
-            alive += not noticed
-            verdict = f"killed by {noticed}" if noticed else "SURVIVED"
-            print(f"{mutant.place}: {mutant.old} → {mutant.new}\n    {verdict}", flush=True)
+        noticed = pool.map(partial(judge, known=known), chosen)
+        for mutant, edit, killer in zip(chosen, told, noticed, strict=True):
+            print(f"{edit}\n    {f'killed by {killer}' if killer else 'SURVIVED'}", flush=True)
+            rows.append(asdict(mutant) | {"edit": edit, "killed_by": killer})
+            text = json.dumps(rows, indent=1, ensure_ascii=False)
+            (out / f"seed-{seed}.json").write_text(text, encoding="utf-8")
+    killed = sum(bool(row["killed_by"]) for row in rows)
     minutes = (time.monotonic() - begin) / 60.0
-    print(f"\n{len(chosen) - alive} of {len(chosen)} killed, in {minutes:.0f} minutes")
-    if alive > survivors:
-        sys.exit(f"{alive} survive; {survivors} may")
+    print(f"\nseed {seed}: {killed} of {len(rows)} killed, in {minutes:.0f} minutes")
+    if killed < 0.9 * len(rows):
+        sys.exit("fewer than nine of ten")
 
 
 if __name__ == "__main__":
