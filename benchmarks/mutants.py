@@ -391,12 +391,18 @@ def judge(mutant: Mutant, known: Reach) -> str:
         (tree / "chosen.txt").write_text("\n".join(tests), encoding="utf-8")
         longest = SLACK + 4.0 * sum(known.seconds[test] for test in tests)
         code, said = pytest(tree, ["-x", "@chosen.txt"], longest)
+    return verdict(code, said, longest)
+
+
+def verdict(code: int | None, said: str, longest: float) -> str:
+    """What noticed: a test, a test file that cannot be imported, the clock, or a crash."""
     if code is None:
         return f"longer than {longest:.0f} s"
     if code == 0:
         return ""
-    failed = failures(said)
-    if code in (1, 2) and failed:
+    if code < 0:
+        return f"signal {-code}"
+    if failed := failures(said):
         return failed[0]
     raise RuntimeError(f"pytest did not run:\n{said[-3000:]}")
 

@@ -111,3 +111,22 @@ def test_kernels_are_compiled_anew_where_the_edited_module_is_imported(tmp_path:
         kept[name].touch()
     mutants.forget_compiled(tmp_path, "hqp_grasp/hierarchy/a.py")
     assert [name for name, path in kept.items() if path.exists()] == ["c"]
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "told"),
+    [
+        (0, "1 passed", ""),
+        (1, "FAILED tests/a/test_b.py::test_c[1] - assert", "tests/a/test_b.py::test_c[1]"),
+        (4, "ERROR tests/test_a.py - NameError: b", "tests/test_a.py"),
+        (-11, "", "signal 11"),
+        (None, "", "longer than 9 s"),
+    ],
+)
+def test_what_noticed_is_named(code: int | None, said: str, told: str) -> None:
+    assert mutants.verdict(code, said, 9.0) == told
+
+
+def test_a_run_that_tried_no_test_has_noticed_nothing() -> None:
+    with pytest.raises(RuntimeError, match="did not run"):
+        mutants.verdict(4, "usage: pytest", 9.0)
