@@ -263,7 +263,7 @@ def drawn(sources: dict[str, str], count: int, seed: int) -> list[Mutant]:
 class Reach:
     """Which tests run which lines, and how long each takes."""
 
-    seconds: dict[str, float]  # of each test that passes
+    seconds: dict[str, float]  # of each test function that passes
     lines: dict[str, dict[str, list[str]]]  # module, line, tests
 
     def tests(self, mutant: Mutant) -> list[str]:
@@ -336,18 +336,21 @@ def reach(out: Path) -> Reach:
             code, said = pytest(tree, ["-n", "2", "--junitxml=times.xml", *cover], LONGEST)
             if code not in (0, 1):
                 sys.exit(f"pytest did not run:\n{said[-3000:]}")
-            seconds = {}
+            seconds: dict[str, float] = {}
             for case in ElementTree.parse(tree / "times.xml").iter("testcase"):
                 name = f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
+                name = named(name)
                 if not len(case):  # neither failed nor skipped
-                    seconds[name] = float(case.get("time", 0.0))
+                    seconds[name] = seconds.get(name, 0.0) + float(case.get("time", 0.0))
+            for name in map(named, failures(said)):
+                seconds.pop(name, None)
             if code:
                 print("fail without any mutant, and are left out:", *failures(said), sep="\n  ")
             data = CoverageData(str(tree / ".coverage"))
             data.read()
             lines = {
                 str(Path(name).relative_to(tree)): {
-                    str(line): sorted({c.rpartition("|")[0] for c in contexts if c})
+                    str(line): sorted({named(c.rpartition("|")[0]) for c in contexts if c})
                     for line, contexts in data.contexts_by_lineno(name).items()
                 }
                 for name in data.measured_files()
@@ -355,6 +358,11 @@ def reach(out: Path) -> Reach:
         out.mkdir(parents=True, exist_ok=True)
         kept.write_text(json.dumps({"seconds": seconds, "lines": lines}), encoding="utf-8")
     return Reach(**json.loads(kept.read_text(encoding="utf-8")))
+
+
+def named(test: str) -> str:
+    """A test without its parameters, which a mutant may call otherwise."""
+    return test.partition("[")[0]
 
 
 def failures(said: str) -> list[str]:

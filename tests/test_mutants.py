@@ -130,3 +130,9 @@ def test_what_noticed_is_named(code: int | None, said: str, told: str) -> None:
 def test_a_run_that_tried_no_test_has_noticed_nothing() -> None:
     with pytest.raises(RuntimeError, match="did not run"):
         mutants.verdict(4, "usage: pytest", 9.0)
+
+
+def test_a_test_is_found_whatever_a_mutant_makes_of_its_parameters() -> None:
+    assert (
+        mutants.named("tests/test_a.py::test_b[Force(radius=0.05)[0]]") == "tests/test_a.py::test_b"
+    )
