@@ -59,6 +59,19 @@ def test_limits_come_before_landing(robot, steps):
             assert np.abs(level.residual(landed)).max() <= ROUNDING
 
 
+def test_a_step_already_beyond_its_limits_is_neither_forced_back_nor_taken_farther(robot, steps):
+    stack = stack_of("fmk").within(StepLimit(0.02, 10.0))  # joints only: [rad], [m]
+    beyond = 0
+    for grasp, x in [(g, sign * x) for g, x in steps for sign in (1.0, -1.0)]:
+        landed = land(robot, stack, grasp, x)
+        assert missed(robot, grasp, x, landed) < 0.1 * missed(robot, grasp, x, x)
+        for level in stack.limit_levels(grasp):
+            before, after = (np.abs(level.residual(y)) for y in (x, landed))
+            assert (after <= before + ROUNDING).all()
+            beyond += np.count_nonzero(before)
+    assert beyond
+
+
 def test_a_step_that_lands_by_itself_is_left_as_it_is(robot, steps):
     stack = stack_of("fmk").within(StepLimit())
     for grasp, x in steps:
