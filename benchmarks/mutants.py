@@ -31,7 +31,8 @@ import tyro
 
 ROOT = Path(__file__).parents[1]
 TREE = ("hqp_grasp", "robots", "scenarios", "tests", "docs", "benchmarks")  # what tests read
-FILES = ("pyproject.toml", "README.md", "CONTRIBUTING.md", "Makefile", "mkdocs.yml")
+FILES = ("pyproject.toml", "Makefile", "mkdocs.yml", "LICENSE", "CITATION.cff")
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 SLACK = 120.0  # [s] for imports and compiling, beside 4 × the time that the tests take
 LONGEST = 1800.0  # [s] for all tests
 
@@ -294,7 +295,7 @@ def copied(folder: Path) -> Path:
     """A copy of the tree in `folder`, with what Python and numba have compiled."""
     for name in TREE:
         shutil.copytree(ROOT / name, folder / name)
-    for name in FILES:
+    for name in FILES + PAGES:
         shutil.copy2(ROOT / name, folder / name)
     return folder
 
