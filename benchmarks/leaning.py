@@ -2,11 +2,12 @@
 
     python benchmarks/leaning.py --starts 50 --seed 70
 
-Cups (frusta, wider above) whose walls lean by 0, 1, 3, 5 and 8°, a sphere, an ellipsoid and a cone.
-With `--outside` the groceries of `make outside` too. Columns: trials that end good; that end secure
-(a friction of 0.2 holds the last grasp, of 0.3 where DEMAND says so); that felt such a grasp and do
-not end in one; the probe of the first such, and the one from which all are, to the end (medians of
-the trials that have it); what keeps the others from balance, most often.
+Cups (frusta, wider above) whose walls lean by 0, 1, 3, 5 and 8°, a sphere, an ellipsoid, a cylinder
+on its side and a cone. With `--outside` the groceries of `make outside` too. Columns: trials that
+end good; that end secure (a friction of 0.2 holds the last grasp, of 0.3 where DEMAND says so);
+that felt such a grasp and do not end in one; the probe of the first such, and the one from which
+all are, to the end (medians of the trials that have it); what keeps the others from balance, most
+often.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from outside_objects import OBJECTS, scene_of
 from tqdm import tqdm
 
 import hqp_grasp as hg
-from hqp_grasp.control.settling import SECURE
 from hqp_grasp.experiments.executor import run_all
 from hqp_grasp.experiments.record import secures
+from hqp_grasp.mechanics import SECURE
 
 SIDES = 120  # of the polygon that stands for a circle
 HEIGHT = 0.12  # [m]
@@ -32,6 +33,7 @@ RADIUS = 0.05  # [m] of a cup, half way up
 CUPS = {f"cup {lean}°": lean for lean in (0, 1, 3, 5, 8)}
 CONE = (0.045, 0.2)  # [m] radius of its base, height: walls lean by 12.7°
 CURVED = {"sphere": (0.05, 0.05, 0.05), "ellipsoid": (0.06, 0.04, 0.04)}  # [m] semi-axes
+LYING = (0.04, 0.07)  # [m] radius and half the length of a cylinder on its side
 DEMAND = {"cone": 0.3, "cup 8°": 0.3}  # friction, where leaning takes most of SECURE or more
 
 
@@ -54,9 +56,11 @@ def frustum(below: float, above: float, height: float) -> str:
 def body(name: str) -> hg.Body:
     """The object of that name."""
     with tempfile.TemporaryDirectory() as folder:
-        if name in CURVED:
-            size = " ".join(map(str, CURVED[name]))
-            geom = f"<geom type='ellipsoid' size='{size}'/>"
+        if name in CURVED or name == "lying":
+            kind = "cylinder" if name == "lying" else "ellipsoid"
+            size = " ".join(map(str, CURVED.get(name, LYING)))
+            turned = " euler='0 90 0'" if name == "lying" else ""
+            geom = f"<geom type='{kind}' size='{size}'{turned}/>"
             path = Path(folder) / f"{name}.xml"
             path.write_text(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
         else:
@@ -134,7 +138,7 @@ def main(
         outside: groceries too
         jobs: processes
     """
-    names = only or (*CUPS, *CURVED, "cone", *(OBJECTS if outside else ()))
+    names = only or (*CUPS, *CURVED, "lying", "cone", *(OBJECTS if outside else ()))
     work = Work(names, starts, probes, seed)
     numbers = range(len(names) * starts)
     done = dict(tqdm(run_all(work, numbers, jobs), total=len(numbers)))

@@ -24,9 +24,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 import hqp_grasp as hg
-from hqp_grasp.control.settling import BEYOND
 from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT
 from hqp_grasp.experiments.start import FirstTouch
+from hqp_grasp.grasp import BEYOND
 from hqp_grasp.world.imperfections import FAULTS, Fault
 
 OBJECTS = {

@@ -11,6 +11,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, instance, not_negative
 
+BEYOND = 4.0  # times the floor of noise, within which a felt error says nothing
 UNIT_NORMAL_TOLERANCE = 1e-6  # | ‖n‖ − 1 | accepted in a sensed normal
 
 
@@ -156,6 +157,12 @@ class Grasp:
     def normals(self) -> np.ndarray:
         """Outward unit normals (k, 3), world."""
         return as_array("Grasp.normals", [c.normal for c in self.contacts], (self.k, 3))
+
+    @cached_property
+    def centers(self) -> np.ndarray:
+        """c_i = x_i + ρ_i n_i (k, 3) [m], world: the round tips' centres."""
+        rho = np.array([[contact.tip_radius] for contact in self.contacts])
+        return as_array("Grasp.centers", self.positions + rho * self.normals, (self.k, 3))
 
     @cached_property
     def floor(self) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from hqp_grasp.grasp import UNIT_NORMAL_TOLERANCE, as_array
 from hqp_grasp.kernels import njit
 
 FLOOR = 0.2  # [–] of the mean normal force that each contact keeps: none only looks on
+SECURE = 0.2  # [–] friction demand of a grasp that holds on nearly all that hands touch, at most
 FLAT = 1e-9  # [–] singular value that counts as none, where the largest is about 1
 MILD = 1e-2  # [–] singular value that is far from none
 CENTRED = 0.25  # Newton decrement at which a point counts as the centre

@@ -26,6 +26,7 @@ PYTHON_ON = [
     "CONTRIBUTING.md",
     "README.md",
     "any-robot.md",
+    "change-a-rule.md",
     "forces.md",
     "index.md",
     "judging.md",

@@ -13,7 +13,7 @@ FLOORS = (
     ("files",),
     ("grasp",),
     ("mechanics",),
-    ("history", "hierarchy", "world"),
+    ("history", "hierarchy", "world", "surface"),
     ("tasks",),
     ("control", "touch"),
     ("judge",),

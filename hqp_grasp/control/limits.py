@@ -151,5 +151,16 @@ def cap_ratios(steps: np.ndarray, stack: Stack, grasp: Grasp) -> np.ndarray:
     return ratios
 
 
+def room_left(x: np.ndarray, more: np.ndarray, stack: Stack, grasp: Grasp) -> float:
+    """The largest share t in [0, 1] with x + t·more (n,) within the caps, where x is."""
+    room = 1.0
+    for level in _caps(stack, grasp):
+        value, change = level.A @ x, level.A @ more
+        left = np.where(change > 0.0, level.upper - value, value - level.lower)
+        far = np.abs(change) > 0.0
+        room = min(room, float((left[far] / np.abs(change[far])).min(initial=1.0)))
+    return max(room, 0.0)
+
+
 def _caps(stack: Stack, grasp: Grasp) -> list[Level]:
     return [limit.level(grasp) for limit in stack.limits if limit.priority is Priority.CAP]

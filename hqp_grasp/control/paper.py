@@ -8,7 +8,8 @@ from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks import KinematicTask
-from hqp_grasp.tasks.contact_space import ContactSpaceTask
+from hqp_grasp.tasks.contact_space import ContactSpaceTask, in_contact_space
+from hqp_grasp.tasks.kinematic import is_kinematic
 from hqp_grasp.tasks.stack import Stack
 
 
@@ -22,7 +23,7 @@ def contact_step(stack: Stack, grasp: Grasp) -> np.ndarray:
     step = np.zeros(3 * grasp.k)
     above = np.zeros((0, 3 * grasp.k))
     for task in laws(stack):
-        if not isinstance(task, ContactSpaceTask):
+        if not in_contact_space(task):
             continue
         J = task.contact_jacobian(grasp)
         curvature = 2.0 * np.linalg.norm(J, 2) ** 2
@@ -40,7 +41,7 @@ def paper_levels(stack: Stack, grasp: Grasp) -> list[Level]:
     """
     rest = np.zeros(grasp.n)
     for task in laws(stack):
-        if isinstance(task, KinematicTask):
+        if is_kinematic(task):
             rest -= task.gain * task.gradient(grasp)
     return [
         Level.equal(grasp.jacobian, contact_step(stack, grasp), "contact step"),
@@ -55,7 +56,7 @@ def laws(stack: Stack) -> list[ContactSpaceTask | KinematicTask]:
     """
     if reason := why_not(stack):
         raise InputError(reason)
-    return [task for task in stack.tasks if isinstance(task, ContactSpaceTask | KinematicTask)]
+    return [task for task in stack.tasks if in_contact_space(task) or is_kinematic(task)]
 
 
 def why_not(stack: Stack) -> str:
@@ -65,14 +66,14 @@ def why_not(stack: Stack) -> str:
         if len(beside) > 1:
             return "the paper's form has one law a priority: compose with >>, not +"
         task = beside[0]
-        if not isinstance(task, ContactSpaceTask | KinematicTask):
+        if not (in_contact_space(task) or is_kinematic(task)):
             return (
                 "the paper's form composes contact-space laws and KinematicTask; "
                 f"{task.name} is neither"
             )
         if below:
             return "the paper's form has its kinematic law last; use another form"
-        below = isinstance(task, KinematicTask)
+        below = is_kinematic(task)
     return ""
 
 

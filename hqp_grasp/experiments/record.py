@@ -10,18 +10,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hqp_grasp.control.settling import BEYOND, FORCE_GOAL, MOMENT_GOAL, SECURE
 from hqp_grasp.errors import SingularTaskError, one_of
-from hqp_grasp.grasp import Grasp, Missed
+from hqp_grasp.grasp import BEYOND, Grasp, Missed
 from hqp_grasp.hierarchy.level import Solution
-from hqp_grasp.mechanics import friction_demand
+from hqp_grasp.mechanics import SECURE, friction_demand
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.tasks.stack import Stack, Task
 from hqp_grasp.touch.simulated import SimulatedHand
 from hqp_grasp.world.robot import Robot
 
-CONVERGED_FORCE = FORCE_GOAL  # [N²]
-CONVERGED_MOMENT = float(np.sqrt(MOMENT_GOAL))  # √ε_m [N·m]
+CONVERGED_FORCE = ForceTask.goal  # [N²]
+CONVERGED_MOMENT = float(np.sqrt(MomentTask.goal))  # √ε_m [N·m]
 
 LEAN_STEPS = 20  # after which the direction that normals lean towards stands still
 PLACES = 6  # decimals of normals that tell two places apart

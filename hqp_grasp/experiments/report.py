@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hqp_grasp.control.settling import SECURE
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.parts import read_results
 from hqp_grasp.experiments.record import (
@@ -27,6 +26,7 @@ from hqp_grasp.experiments.record import (
     secures,
     verdicts,
 )
+from hqp_grasp.mechanics import SECURE
 
 Z = 1.96  # standard deviations of a 95 % interval
 SHOWN = 5  # trials named of each kind of failure

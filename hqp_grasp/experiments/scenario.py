@@ -18,7 +18,6 @@ import tyro
 
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
-from hqp_grasp.control.settling import BEYOND, SECURE
 from hqp_grasp.errors import HqpGraspError, InputError, ResultsError, TrialError
 from hqp_grasp.experiments.plain import speak_plainly
 from hqp_grasp.experiments.plots import convergence
@@ -38,6 +37,8 @@ from hqp_grasp.experiments.replay import frames_of_rows, need_viser, rows_of, wr
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.experiments.view import PORT, serve
+from hqp_grasp.grasp import BEYOND
+from hqp_grasp.mechanics import SECURE
 from hqp_grasp.tasks import Stack, stack_of
 from hqp_grasp.touch.noisy import Noise
 from hqp_grasp.world.scene import Scene

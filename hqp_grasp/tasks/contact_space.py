@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import TypeGuard
 
 import numpy as np
 
@@ -42,6 +43,11 @@ class ContactSpaceTask(Task):
     def contact_gradient(self, grasp: Grasp) -> np.ndarray:
         """∂ε/∂x = 2 (∂e/∂x)ᵀ e (3k,) (paper, eq. 2–3 and 5–6)."""
         return 2.0 * (self.error(grasp) @ self.contact_jacobian(grasp))
+
+
+def in_contact_space(task: Task) -> TypeGuard[ContactSpaceTask]:
+    """Whether the law's error depends on the joints only through where the contacts are."""
+    return isinstance(task, ContactSpaceTask)
 
 
 def cross_matrices(v: np.ndarray) -> np.ndarray:

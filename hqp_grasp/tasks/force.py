@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ class ForceTask(ContactSpaceTask):
     """
 
     radius: float = 0.05  # r [m], of the sphere each contact is taken to move on
+    goal: ClassVar[float] = 1e-3  # [N²]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -28,6 +30,10 @@ class ForceTask(ContactSpaceTask):
     def error(self, grasp: Grasp) -> np.ndarray:
         """Net force f = −Σ n_i (3,) [N], world."""
         return -grasp.normals.sum(axis=0)
+
+    def floor(self, grasp: Grasp) -> float:
+        """ε_f [N²] that noise makes of a balanced grasp, on average."""
+        return grasp.floor[0]
 
     def contact_jacobian(self, grasp: Grasp) -> np.ndarray:
         """∂f/∂x_i = −(I − n_i n_iᵀ)/(r + ρ_i), side by side (3, 3k) [N/m], world.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 
@@ -62,6 +63,11 @@ class KinematicTask(Task):
         set_field(self, "gain", SETTLES[form] if gain is None else gain)
         set_field(self, "weight", weight)
         self.__post_init__()
+
+    @property
+    def unit(self) -> str:
+        """[rad] for "angle", [m/rad] for "eq7"."""
+        return "rad" if self.kind == "angle" else "m/rad"
 
     def __repr__(self) -> str:
         return (
@@ -123,6 +129,11 @@ class KinematicTask(Task):
         if self.kind == "eq7":
             return _eq7(grasp.normals, JT)
         return _angle(grasp, JT)
+
+
+def is_kinematic(task: Task) -> TypeGuard[KinematicTask]:
+    """Whether the paper's form has this law last, in joint space."""
+    return isinstance(task, KinematicTask)
 
 
 def _flexion_columns(grasp: Grasp) -> np.ndarray:

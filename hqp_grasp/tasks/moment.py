@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,7 @@ class MomentTask(ContactSpaceTask):
     """
 
     reference: str | ArrayLike = "centroid"  # c: the contacts' mean, or a point (3,) [m], world
+    goal: ClassVar[float] = (2e-3) ** 2  # [(N·m)²]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,6 +44,10 @@ class MomentTask(ContactSpaceTask):
         c = x.sum(axis=0) / grasp.k if isinstance(self.reference, str) else np.array(self.reference)
         moments = cross_matrices(grasp.normals) @ (x - c)[:, :, None]
         return moments.sum(axis=0)[:, 0]
+
+    def floor(self, grasp: Grasp) -> float:
+        """ε_m [(N·m)²] that noise makes of a balanced grasp, on average."""
+        return grasp.floor[1]
 
     def contact_jacobian(self, grasp: Grasp) -> np.ndarray:
         """∂m/∂x_i, side by side (3, 3k) [N], world.

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import mink
 import numpy as np
@@ -26,6 +27,7 @@ class Task(ABC):
 
     gain: float = 1.0  # [–] share of the error to remove in one probe; 1 is a full Newton step
     weight: float = 1.0  # [–] scales the rows; matters only beside other tasks on one level
+    goal: ClassVar[float | None] = None  # eᵀe with which the law is content; None: with 0 only
 
     def __post_init__(self) -> None:
         for setting in ("gain", "weight"):
@@ -44,6 +46,15 @@ class Task(ABC):
     @abstractmethod
     def jacobian(self, grasp: Grasp) -> np.ndarray:
         """∂error/∂q (r, n) [unit of the error / rad]."""
+
+    @property
+    def unit(self) -> str:
+        """Of the error; "rad" where it compares with joint motions as it is."""
+        return ""
+
+    def floor(self, grasp: Grasp) -> float:
+        """What noise of the contacts makes of eᵀe where it vanishes, on average."""
+        return 0.0
 
     def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
         """The equality rows (A, b) asked of x = Δq over one probe: jacobian·x = −gain·error."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import combinations
 
 import mujoco
@@ -82,6 +83,54 @@ class SelfClearance:
     def collisions(self, q: np.ndarray) -> tuple[tuple[str, str], ...]:
         """The pairs that overlap at q (n,)."""
         return self.near(q, 0.0).names
+
+
+@dataclass(frozen=True, eq=False)
+class LinkBalls:
+    """The links that are to keep out of the object, each geom as balls along its longest side.
+
+    Left out is what touches. A capsule is these balls; what is wider one way than the other counts
+    by the mean of the two.
+    """
+
+    robot: Robot
+    bodies: np.ndarray = field(init=False)  # (B,) ids
+    centers: np.ndarray = field(init=False)  # (B, 3) [m], bodies' frames
+    radii: np.ndarray = field(init=False)  # (B,) [m]
+
+    def __post_init__(self) -> None:
+        model = self.robot.model
+        touching = {geom for geoms in self.robot.geoms for geom in geoms}
+        bodies, centers, radii = [], [], []
+        for g in set(_pairs(self.robot).ravel().tolist()) - touching:
+            half = np.sort(model.geom_aabb[g, 3:])
+            radius = float(half[:2].mean())
+            R = np.zeros(9)
+            mujoco.mju_quat2Mat(R, model.geom_quat[g])
+            axis = R.reshape(3, 3)[:, int(model.geom_aabb[g, 3:].argmax())]
+            middle = model.geom_pos[g] + R.reshape(3, 3) @ model.geom_aabb[g, :3]
+            room = max(half[2] - radius, 0.0)
+            for s in np.linspace(-room, room, 1 + 2 * int(np.ceil(room / radius))):
+                bodies.append(int(model.geom_bodyid[g]))
+                centers.append(middle + s * axis)
+                radii.append(radius)
+        put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        put("bodies", np.array(bodies))
+        put("centers", np.array(centers))
+        put("radii", np.array(radii))
+
+    def depth(self, q: np.ndarray, u: np.ndarray, h: np.ndarray) -> float:
+        """How deep [m] the deepest ball is in {x: u·x ≤ h}, u (m, 3) and h (m,) [m]; < 0: clear."""
+        data = self.robot._at(q)
+        R = data.xmat[self.bodies].reshape(-1, 3, 3)
+        c = data.xpos[self.bodies] + (R @ self.centers[:, :, None])[:, :, 0]
+        return float((self.radii - (c @ u.T - h).max(axis=1)).max(initial=-np.inf))
+
+
+@lru_cache(maxsize=8)
+def link_balls(robot: Robot) -> LinkBalls:
+    """The links of a robot as balls, made once."""
+    return LinkBalls(robot)
 
 
 def _pairs(robot: Robot) -> np.ndarray:

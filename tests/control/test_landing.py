@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from hqp_grasp.control.controller import Controller
+from hqp_grasp.control.episode import Episode
 from hqp_grasp.control.landing import land
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.experiments.trial import Trial
+from hqp_grasp.grasp import Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import stack_of
 from hqp_grasp.world.scene import Scene
@@ -31,10 +33,13 @@ def robot(scene):
 def steps(scene, robot):
     """Grasps felt, each with the step that the laws ask for."""
     stack = stack_of("fmk")
-    plan = Controller(robot, stack).form.plan
-    limited = Controller(robot, stack).stack
+    form, limited = Controller(robot, stack).form, Controller(robot, stack).stack
     records = [Trial(scene, stack, probes=2).run((616, i)) for i in range(3)]
-    return [(g, plan(limited, g).x) for record in records for g in record.grasps]
+    return [
+        (g, form.plan(limited, Episode.of([Touch(g.q, g)])).x)
+        for record in records
+        for g in record.grasps
+    ]
 
 
 def missed(robot, grasp, x, landed):

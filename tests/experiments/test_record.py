@@ -185,7 +185,7 @@ def test_the_rule_that_planned_a_step_stands_in_its_row(record, scene):
     assert [row["planner"] for row in record.rows] == [None] + ["memoryless"] * PROBES
     assert record.to_table()["planner"].type == pa.string()
     rows = Trial(scene, ForceTask() >> MomentTask(), probes=12).run(0).rows
-    assert {row["planner"] for row in rows[1:]} >= {"surface memory", "return to the best grasp"}
+    assert {row["planner"] for row in rows[1:]} >= {"surface felt", "return to the best grasp"}
 
 
 # ---------------------------------------------------------------- contacts and joints

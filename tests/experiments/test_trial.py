@@ -7,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from hqp_grasp.control.controller import CLIP_TOLERANCE, SHARES
+from hqp_grasp.control.controller import CLIP_TOLERANCE
+from hqp_grasp.control.episode import MissPolicy
 from hqp_grasp.control.forms import TOUCH_RANK, PaperForm, clip_to_limits
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import InputError, ReachError
@@ -28,6 +29,8 @@ PROBES = 10
 GAP = 1e-8  # [rad] asked for
 TIMINGS = {"solve_us"}
 MISSED = Missed(Miss.NO_TOUCH, "finger_2")
+
+SHARES = MissPolicy().shares
 
 
 class Hand:

@@ -1,15 +1,16 @@
-"""What has been felt of the object, as a surface that predicts what has not."""
+"""What all touches felt of the surface: points and outward normals, each with its doubt."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from hqp_grasp.control.outline import Outline, directions, wrapped
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp, Touch
+from hqp_grasp.surface.outline import wrapped
 
 CONTRADICTION = 2e-4  # [m] a point may lie beyond the tangent plane of another
 SLACK = 2e-6  # [m] rounding of what was felt
@@ -22,43 +23,31 @@ UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
 UPRIGHT = 2e-3  # [–] the same, below which normals count alike for the axis, others the less
 AXIS_STEPS = 10  # after which the axis that rims would turn stands still, to 1e-5
-WIDEST = 2.0  # [–] balls are this many times as large as the prior one at most
-EDGE = 1e-3  # [m] a smaller ball is an edge
-EDGE_TURN = 0.5  # [–] share of the angle left, by which an edge is taken to turn on
-SHARPER = 0.6  # [–] radius that each further touch of a face leaves of its corners
-FLATTER = 0.5  # [m] radius of what counts as flat
-FLAT = 1e-3  # [m] a face is known to be flat where it was felt so far apart
-CORNER = 2.4  # [rad] neighbouring faces turn by less where they meet
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceMemory:
-    """Every contact felt, by any finger, and the roundest surface through all of them.
+class Felt:
+    """Every contact felt, by any finger, but for what newer ones contradict.
 
-    Each contact says that the object, being convex, lies behind its tangent plane. The largest ball
-    that touches the surface there from inside and stays behind every plane felt has the radius
+    Each says that the object, being convex, lies behind its tangent plane. The largest ball that
+    touches the surface there from inside and stays behind every plane felt has the radius
 
-        R_j = min_k n_k·(x_k − x_j)/(1 − n_k·n_j).
+        R_j = min_k n_k·(x_k − x_j)/(1 − n_k·n_j),
 
-    The surface predicted is the hull of these balls: exact on cylinders and spheres from the first
-    grasp, flat between points of one face, sharp at an edge felt beside its face, and elsewhere as
-    round as what was felt allows.
+    at most `widest` where nothing bounds it.
     """
 
     positions: np.ndarray  # x (N, 3) [m], world
     normals: np.ndarray  # n (N, 3), outward, world
     probes: np.ndarray  # (N,) which touch of the history felt it
-    radii: np.ndarray  # R (N,) [m]
     noise: np.ndarray  # (N,) [rad] standard errors of the normals
     tip_radii: np.ndarray  # (N,) [m] of what felt them
-    widest: float  # [m] radius of balls that nothing felt bounds
+    by_balls: np.ndarray  # (N,) whether that was a ball, which has no edges of its own
+    widest: float  # [m]
 
     @classmethod
-    def of(cls, history: Sequence[Touch], radius: float = 0.05) -> SurfaceMemory:
-        """What the hits of a history felt, but for what newer ones contradict.
-
-        `radius` [m] is the object's, where nothing felt bounds it.
-        """
+    def of(cls, history: Sequence[Touch], widest: float = 0.1) -> Felt:
+        """What the hits of a history felt; raise InputError where there are none."""
         hits = [(i, t.felt) for i, t in enumerate(history) if isinstance(t.felt, Grasp)]
         if not hits:
             raise InputError("nothing has been felt yet: a memory begins with the first grasp")
@@ -67,13 +56,16 @@ class SurfaceMemory:
         probes = np.concatenate([np.full(grasp.k, i) for i, grasp in hits])
         noise = np.array([c.noise for _, grasp in hits for c in grasp.contacts])
         tip = np.array([c.tip_radius for _, grasp in hits for c in grasp.contacts])
+        by_balls = np.array([c.stretch is None for _, grasp in hits for c in grasp.contacts])
         beyond = n @ x.T - (n * x).sum(axis=1)[:, None]
-        apart = beyond > CONTRADICTION + _doubt(x, noise, tip)
+        apart = beyond > CONTRADICTION + doubt(x, noise, tip)
         kept = ~((apart | apart.T) & (probes > probes[:, None])).any(axis=1)
-        x, n, noise, tip = x[kept], n[kept], noise[kept], tip[kept]
-        widest = WIDEST * radius
-        balls = _balls(x, n, noise, tip, widest)
-        return cls(x, n, probes[kept], balls, noise, tip, widest)
+        return cls(x[kept], n[kept], probes[kept], noise[kept], tip[kept], by_balls[kept], widest)
+
+    @cached_property
+    def radii(self) -> np.ndarray:
+        """R (N,) [m]."""
+        return balls(self.positions, self.normals, self.noise, self.tip_radii, self.widest)
 
     def axis(self, grasp: Grasp) -> np.ndarray:
         """The direction (3,) along which nothing curves, as far as was felt.
@@ -94,31 +86,6 @@ class SurfaceMemory:
             if not weight.any():
                 break
         return np.asarray(axis * np.sign(axis[np.abs(axis).argmax()]))
-
-    def outline(self, axis: np.ndarray, tip_radius: float) -> Outline:
-        """The surface as seen along `axis`: from normals across it, and around all other points."""
-        across = np.abs(self.normals @ axis) < LEANING
-        first = np.eye(3)[np.abs(axis).argmin()]
-        first = first - (first @ axis) * axis
-        first /= np.linalg.norm(first)
-        frame = np.array([first, np.cross(axis, first)])
-        x, R = self.positions[across] @ frame.T, self.radii[across]
-        n = self.normals[across] @ frame.T
-        n /= np.linalg.norm(n, axis=1)[:, None]
-        felt = np.arctan2(n[:, 1], n[:, 0])
-        if self.noise.any():
-            tip = self.tip_radii[across]
-            c = x + tip[:, None] * n
-            felt, noise = narrowed(c, felt, self.noise[across])
-            n = directions(felt)
-            x = c - tip[:, None] * n
-            R = _balls(x, n, noise, tip, self.widest)
-        corners, sharp = _corners(x, n, felt)
-        R = np.minimum(R, _beside_edges(x, n, R, felt))
-        within = self.positions[~across] @ frame.T  # of end faces and their rims
-        c = np.concatenate([x - R[:, None] * n, corners, within])
-        R = np.concatenate([R, sharp, np.zeros(len(within))])
-        return Outline.around(c, R, frame, tip_radius, felt)
 
 
 def steadied(history: Sequence[Touch]) -> tuple[Touch, ...]:
@@ -175,17 +142,17 @@ def narrowed(c: np.ndarray, t: np.ndarray, noise: np.ndarray) -> tuple[np.ndarra
     return wrapped(t + np.where(explained, turn, 0.0)), error
 
 
-def _doubt(x: np.ndarray, noise: np.ndarray, tip: np.ndarray) -> np.ndarray:
+def doubt(x: np.ndarray, noise: np.ndarray, tip: np.ndarray) -> np.ndarray:
     """How far [m] over the plane of point j noise may lift point k, (N, N) [j, k]."""
     far = np.linalg.norm(x - x[:, None], axis=-1)
     return np.asarray(SURE * noise[:, None] * (far + tip[:, None]))
 
 
-def _balls(
+def balls(
     x: np.ndarray, n: np.ndarray, noise: np.ndarray, tip: np.ndarray, widest: float
 ) -> np.ndarray:
     """Radii (N,) [m] of the largest balls behind all planes, but for what noise may have lifted."""
-    slack, same = SLACK + _doubt(x, noise, tip), 0.5 * SURE**2 * (noise[:, None] + noise) ** 2
+    slack, same = SLACK + doubt(x, noise, tip), 0.5 * SURE**2 * (noise[:, None] + noise) ** 2
     return largest_balls(x, n, x, n, widest, slack, SAME_NORMAL + same)
 
 
@@ -208,58 +175,3 @@ def largest_balls(
     tells = turn > same
     bound = np.where(tells, (np.maximum(gap, 0.0) + slack) / np.where(tells, turn, 1.0), widest)
     return np.asarray(bound.min(axis=0, initial=widest))
-
-
-def _beside_edges(x: np.ndarray, n: np.ndarray, R: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """Radii that let edges turn on, by a share of the angle that the points felt leave them."""
-    edge = np.flatnonzero(R < EDGE)
-    d = x - x[edge][:, None]
-    bearing = (np.arctan2(d[..., 1], d[..., 0]) - felt[edge][:, None]) % (2.0 * np.pi)
-    bearing = np.where(np.linalg.norm(d, axis=-1) > EDGE, bearing, np.pi)
-    left = np.maximum(bearing.min(axis=1, initial=2.0 * np.pi) - 0.5 * np.pi, 0.0)
-    right = np.maximum(1.5 * np.pi - bearing.max(axis=1, initial=0.0), 0.0)
-    t = np.tile(felt[edge], 2) + EDGE_TURN * np.concatenate([left, -right])
-    normal = np.column_stack([np.cos(t), np.sin(t)])
-    return largest_balls(x, n, np.tile(x[edge], (2, 1)), normal, np.inf)
-
-
-def _corners(x: np.ndarray, n: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Discs (c, R) in the corners of faces and their neighbours, be those faces or edges.
-
-    The largest that fits has R = min(d_a, d_b)/tan(half the turn), with d the way from the last
-    point felt to the corner; the more often a face was found flat, the smaller it is taken to be.
-    """
-    order = np.argsort(felt)
-    turn = np.diff(felt[order], append=felt[order[0]] + 2.0 * np.pi)
-    last = np.flatnonzero(turn > np.sqrt(2.0 * SAME_NORMAL))  # of each group of equal normals
-    G = len(last)
-    if G < 2:
-        return np.zeros((0, 2)), np.zeros(0)
-    group = np.empty(len(felt), dtype=int)
-    group[order] = np.searchsorted(last, np.arange(len(felt))) % G
-    normal, h = n[order[last]], (n[order[last]] * x[order[last]]).sum(axis=1)
-    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-    along = (x * tangent[group]).sum(axis=1)
-    low, high = np.full(G, np.inf), np.full(G, -np.inf)
-    np.minimum.at(low, group, along)
-    np.maximum.at(high, group, along)
-    first = np.append(last[-1] + 1 - len(felt), last[:-1] + 1)  # of each group
-    spread = (felt[order[last]] - felt[order[first % len(felt)]]) % (2.0 * np.pi)
-    flat = high - low
-    flat[spread * FLATTER > flat] = 0.0
-    flat = np.where(flat > FLAT, np.bincount(group, minlength=G) - 1.0, 0.0)
-    a, b = np.arange(G), (np.arange(G) + 1) % G
-    a = a[(turn[last] < CORNER) & (flat[a] + flat[b] > 0.0)]
-    b, half = (a + 1) % G, 0.5 * turn[last[a]]
-    planes = np.stack([normal[a], normal[b]], axis=1)
-    solved = np.linalg.solve(
-        planes, np.stack([[h[a], h[b]], np.ones((2, len(a)))], -1).swapaxes(0, 1)
-    )
-    corner, inward = solved[..., 0], solved[..., 1]
-    to_a = np.maximum((corner * tangent[a]).sum(axis=1) - high[a], SLACK)
-    to_b = np.maximum(low[b] - (corner * tangent[b]).sum(axis=1), SLACK)
-    sharp = SHARPER ** np.minimum(flat[a] + flat[b], 30.0)
-    sharp = sharp * np.minimum(to_a, to_b) / np.tan(half)
-    c = corner - sharp[:, None] * inward
-    behind = (c @ n.T + sharp[:, None] < (n * x).sum(axis=1) + 1e-5).all(axis=1)
-    return c[behind], sharp[behind]

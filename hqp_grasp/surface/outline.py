@@ -11,8 +11,9 @@ FIRST_WINS = 1e-8  # [m] by which a later disc must stick out to count
 SHORTEST = 5e-4  # [m] of a straight piece along which contacts may be moved
 SAME_ANGLE = 1e-4  # [rad] straight pieces nearer than this to an angle have it
 GRID = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)  # [rad] where balance is tried at least
+NEWTON = 10  # steps, from angles to those nearest that sum to zero
+FLATTEST = 1e-3  # [–] of normals, below which turning them leaves their sum as it is
 MOMENT_WORTH = 50.0  # [–] m of way for which 1 N·m per N of moment left is taken
-DOUBT_WORTH = 0.5  # [–] m of way for which 1 m of arc between felt points is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,6 @@ class Outline:
     radius: np.ndarray  # (P,) [m]
     along: np.ndarray  # (P, 2) [m]
     tip_radius: float  # ρ [m] that arc lengths are of
-    felt: np.ndarray  # (N,) [rad] angles of the normals felt, growing
     straight: np.ndarray = field(init=False)  # (P,) [m] length of a straight piece, 0 for arcs
     start: np.ndarray = field(init=False)  # (P,) [m]
     size: np.ndarray = field(init=False)  # (P,) [m] arc length of each piece
@@ -45,11 +45,8 @@ class Outline:
         put("length", float(ends[-1]))
 
     @classmethod
-    def around(
-        cls, c: np.ndarray, R: np.ndarray, frame: np.ndarray, tip_radius: float, felt: np.ndarray
-    ) -> Outline:
+    def around(cls, c: np.ndarray, R: np.ndarray, frame: np.ndarray, tip_radius: float) -> Outline:
         """The hull of discs with centres c (N, 2) and radii R (N,) [m]."""
-        felt = np.sort(felt)
         theta = np.linspace(-np.pi, np.pi, DIRECTIONS, endpoint=False)
         support = directions(theta) @ c.T + (R - FIRST_WINS * np.arange(len(R)))
         best = support.argmax(axis=1)
@@ -57,7 +54,7 @@ class Outline:
         if not len(change):
             whole, one = np.array([-np.pi]), best[:1]
             turn, still = np.array([2.0 * np.pi]), np.zeros((1, 2))
-            return cls(frame, whole, turn, c[one], R[one], still, tip_radius, felt)
+            return cls(frame, whole, turn, c[one], R[one], still, tip_radius)
         # From disc a to disc b the hull passes where n(θ)·(c_a − c_b) = R_b − R_a.
         a, b = best[change - 1], best[change]
         d = c[a] - c[b]
@@ -77,7 +74,7 @@ class Outline:
         along[0::2] = c[b] + R[b, None] * n - base[0::2]
         width[1::2] = np.diff(np.append(t, t[0] + 2.0 * np.pi))
         base[1::2], radius[1::2] = c[b], R[b]
-        return cls(frame, angle, width, base, radius, along, tip_radius, felt)
+        return cls(frame, angle, width, base, radius, along, tip_radius)
 
     def at(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angle of the normal (k,) [rad] and point of the curve (k, 2) [m] at s (k,) [m]."""
@@ -115,13 +112,11 @@ class Outline:
     def balanced(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where contacts at s (k,) could go to balance: costs (C,) [m²] and places (C, k) [m].
 
-        The k unit forces, 2 or 3, point at equal angles, so their sum is zero; contacts keep their
-        order around. What is left of the moment, the way there, and how little is known of the
-        curve there make the cost.
+        Two or three unit forces point at equal angles, so that their sum is zero; of more, the
+        angles are the nearest to today's of which that is true. Contacts keep their order around.
+        What is left of the moment, and the way there, make the cost.
         """
-        k = len(s)
-        place = np.argsort(np.argsort(s))
-        shift = 2.0 * np.pi / k * place
+        shift = summing_to_zero(self.at(s)[0], np.argsort(np.argsort(s)))
         found = [self._on_arcs(s, shift), self._on_straights(s, shift)]
         return np.concatenate([v[0] for v in found]), np.concatenate([v[1] for v in found])
 
@@ -154,7 +149,7 @@ class Outline:
         )
         to = self.start[piece] + (self.radius[piece] + self.tip_radius) * turn
         moment = A[i] * np.cos(t) + B[i] * np.sin(t)
-        return self._cost(s, to, moment, self._doubt(piece, t[:, None] + shift))
+        return self._cost(s, to, moment)
 
     def _on_straights(self, s: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Balance with a contact on a straight piece, along which it balances the moment."""
@@ -184,27 +179,40 @@ class Outline:
         lam = knots[row, i - 1] + share * (knots[row, i] - knots[row, i - 1])
         way = np.clip(lam[:, None], low, high)
         left = at_low + (way - low).sum(axis=1)
-        doubt = np.where(is_straight, 0.0, self._doubt(piece, theta))
-        return self._cost(s, s + way, left, doubt)
+        return self._cost(s, s + way, left)
 
     def _cost(
-        self, s: np.ndarray, to: np.ndarray, moment: np.ndarray, doubt: np.ndarray
+        self, s: np.ndarray, to: np.ndarray, moment: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         way = self.way(s, to)
-        cost = (way * way + (DOUBT_WORTH * doubt) ** 2).sum(axis=1) + (MOMENT_WORTH * moment) ** 2
+        cost = (way * way).sum(axis=1) + (MOMENT_WORTH * moment) ** 2
         return cost, s + way
-
-    def _doubt(self, piece: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        """How long the arc is between the normals felt on either side of θ [m]."""
-        i = np.searchsorted(self.felt, wrapped(theta))
-        gap = (self.felt[i % len(self.felt)] - self.felt[i - 1]) % (2.0 * np.pi)
-        return np.asarray(self.radius[piece] * gap)
 
     def _arc(self, arcs: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """The arc whose normals include the angle θ."""
         first = self.angle[arcs[0]]
         turn = (theta - first) % (2.0 * np.pi)
         return np.asarray(arcs[np.searchsorted(self.angle[arcs] - first, turn, side="right") - 1])
+
+
+def summing_to_zero(theta: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Angles (k,) [rad] of unit vectors that sum to zero, near those given, in that order around.
+
+    The first in the order is at 0. Equal angles where Newton's method leads to none else.
+    """
+    k = len(theta)
+    equal = 2.0 * np.pi / k * place
+    if k <= 3:
+        return equal
+    first = int(place.argmin())
+    t = (theta - theta[first]) % (2.0 * np.pi)
+    for _ in range(NEWTON):
+        n = directions(t)
+        across = np.column_stack([-n[:, 1], n[:, 0]])
+        t = t - np.linalg.pinv(across.T, rcond=FLATTEST) @ n.sum(axis=0)
+    t = t - t[first]
+    ordered = (np.diff(t[np.argsort(place)]) > 0.0).all()
+    return t if ordered and np.abs(directions(t).sum(axis=0)).max() < SAME_ANGLE else equal
 
 
 def directions(theta: np.ndarray) -> np.ndarray:

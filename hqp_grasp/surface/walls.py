@@ -1,0 +1,201 @@
+"""The surface felt as walls along an axis, as a prism has them: an outline, and end faces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hqp_grasp.grasp import Grasp
+from hqp_grasp.surface.felt import LEANING, SAME_NORMAL, SLACK, Felt, balls, narrowed
+from hqp_grasp.surface.outline import Outline, directions
+
+DISTINCT = 10  # ways, at most
+APART = 0.01  # [m] a contact's place differs by, between two ways
+ROOM = 0.01  # [m] kept from end faces that were felt
+ROUNDING = 1e-6  # [m] radius of what bare points touch at an edge
+STILL = 1e-6  # [m] a contact that moves less has no direction
+SHARPER = 0.6  # [–] radius that each further touch of a face leaves of its corners
+FLATTER = 0.5  # [m] radius of what counts as flat
+FLAT = 1e-3  # [m] a face is known to be flat where it was felt so far apart
+CORNER = 2.4  # [rad] neighbouring faces turn by less where they meet
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """The hull of the largest balls behind all planes felt, seen along an axis.
+
+    It is exact on cylinders from the first grasp, flat between points of one face, sharp at an edge
+    felt beside its face, and elsewhere as round as what was felt allows.
+    """
+
+    felt: Felt
+    axis: np.ndarray  # a (3,), across which the outline lies
+    outline: Outline
+
+    @classmethod
+    def of(cls, felt: Felt, axis: np.ndarray, tip_radius: float) -> Walls | None:
+        """The outline from normals across the axis, around all other points; None: there are none.
+
+        `tip_radius` [m] is that of the tips whose centres ride on it.
+        """
+        across = np.abs(felt.normals @ axis) < LEANING
+        if not across.any():
+            return None
+        first = np.eye(3)[np.abs(axis).argmin()]
+        first = first - (first @ axis) * axis
+        first /= np.linalg.norm(first)
+        frame = np.array([first, np.cross(axis, first)])
+        x, R = felt.positions[across] @ frame.T, felt.radii[across]
+        n = felt.normals[across] @ frame.T
+        n /= np.linalg.norm(n, axis=1)[:, None]
+        t = np.arctan2(n[:, 1], n[:, 0])
+        if felt.noise.any():
+            tip = felt.tip_radii[across]
+            c = x + tip[:, None] * n
+            t, noise = narrowed(c, t, felt.noise[across])
+            n = directions(t)
+            x = c - tip[:, None] * n
+            R = balls(x, n, noise, tip, felt.widest)
+        corners, sharp = _corners(x, n, t)
+        within = felt.positions[~across] @ frame.T  # of end faces and their rims
+        c = np.concatenate([x - R[:, None] * n, corners, within])
+        R = np.concatenate([R, sharp, np.zeros(len(within))])
+        return cls(felt, axis, Outline.around(c, R, frame, tip_radius))
+
+    def turn(self, grasp: Grasp) -> np.ndarray:
+        """∂n_i/∂c_i (k, 3, 3) [1/m]: around the axis as the nearest ball felt, not along it."""
+        away = np.linalg.norm(grasp.positions[:, None] - self.felt.positions, axis=2)
+        radius = self.felt.radii[away.argmin(axis=1)] + self.outline.tip_radius
+        around = np.cross(self.axis, grasp.normals)
+        blocks = around[:, :, None] * around[:, None]
+        return np.asarray(blocks / np.maximum(radius, ROUNDING)[:, None, None])
+
+    def reach(self, u: np.ndarray) -> np.ndarray:
+        """As far (m,) [m] along u (m, 3) as was felt: where walls end is not known."""
+        return np.asarray((u @ self.felt.positions.T).max(axis=1))
+
+    def ways(self, grasp: Grasp) -> list[WayAround]:
+        """Ways around the outline that differ, the cheapest first."""
+        s = self.outline.locate(grasp.centers @ self.outline.frame.T)
+        cost, places = self.outline.balanced(s)
+        end = np.abs(grasp.normals @ self.axis) > LEANING
+        height = self._height(grasp, end)
+        ways: list[WayAround] = []
+        left = np.ones(len(cost), dtype=bool)
+        while left.any() and len(ways) < DISTINCT:
+            i = int(np.argmin(np.where(left, cost, np.inf)))
+            left &= np.abs(places - places[i]).max(axis=1) > APART
+            ways.append(WayAround(self, grasp, s, places[i], height, end, float(cost[i])))
+        return ways
+
+    def _height(self, grasp: Grasp, end: np.ndarray) -> float:
+        """Where along the axis all contacts should be [m]: three forces balance in one plane only.
+
+        It is their mean; a contact whose normal leans would first move to the height of its ball's
+        middle. End faces that were felt keep their distance.
+        """
+        x, lean = self.felt.positions @ self.axis, self.felt.normals @ self.axis
+        middle = x - self.felt.radii * lean
+        side = np.abs(lean) < LEANING
+        if not end.all():
+            z = float(middle[-grasp.k :][~end].mean())  # the newest points are this grasp's
+        else:
+            z = float(middle[side].mean() if side.any() else x.mean())
+        top = x[lean > LEANING].min(initial=np.inf) - ROOM
+        bottom = x[lean < -LEANING].max(initial=-np.inf) + ROOM
+        return min(max(z, bottom), top) if bottom < top else 0.5 * (bottom + top)
+
+
+@dataclass(frozen=True, eq=False)
+class WayAround:
+    """Along the outline, where the normal turns as the outline does, and to one height.
+
+    From an end face the way leads out beside the object, then along the axis.
+    """
+
+    walls: Walls
+    grasp: Grasp
+    s: np.ndarray  # (k,) [m] where on the outline contacts are
+    places: np.ndarray  # (k,) [m] where they should be
+    height: float  # [m] along the axis, of all of them
+    end: np.ndarray  # (k,) which contacts are on an end face or its rim, off the outline
+    cost: float  # [m²]
+
+    def at(self, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """The tips' centres (k, 3) [m] and the normals (k, 3) after a share of the way, world."""
+        outline, a = self.walls.outline, self.walls.axis
+        E, n, c = outline.frame, self.grasp.normals, self.grasp.centers
+        rho = np.array([[contact.tip_radius] for contact in self.grasp.contacts])
+        rise = share * (self.height - c @ a)
+        t0, x0 = outline.at(self.s)
+        t1, x1 = outline.at(self.s + share * (self.places - self.s))
+        across, turned = n @ E.T, np.empty((self.grasp.k, 2))
+        cos, sin = np.cos(t1 - t0), np.sin(t1 - t0)
+        turned[:, 0] = cos * across[:, 0] - sin * across[:, 1]
+        turned[:, 1] = sin * across[:, 0] + cos * across[:, 1]
+        after = _unit(turned @ E + (1.0 - share) * np.outer(n @ a, a))
+        motion = (
+            (x1 - x0) @ E + rho * (after - n) + np.outer(rise - rho[:, 0] * ((after - n) @ a), a)
+        )
+        if self.end.any():
+            t, x = outline.at(self.places)
+            side = directions(t) @ E
+            straight = x @ E + rho * side + self.height * a - c
+            sink = np.outer(straight @ a, a)
+            beside = straight - sink
+            out = np.linalg.norm(beside, axis=1)[:, None]
+            down = np.linalg.norm(sink, axis=1)[:, None]
+            done = share * (out + down)
+            straight = beside * np.minimum(done / np.maximum(out, STILL), 1.0)
+            straight += sink * np.clip((done - out) / np.maximum(down, STILL), 0.0, 1.0)
+            end = self.end[:, None]
+            after = np.where(end, _unit((1.0 - share) * n + share * side), after)
+            motion = np.where(end, straight, motion)
+        return c + motion, after
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v / np.linalg.norm(v, axis=1)[:, None])
+
+
+def _corners(x: np.ndarray, n: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Discs (c, R) in the corners of faces and their neighbours, be those faces or edges.
+
+    The largest that fits has R = min(d_a, d_b)/tan(half the turn), with d the way from the last
+    point felt to the corner; the more often a face was found flat, the smaller it is taken to be.
+    """
+    order = np.argsort(felt)
+    turn = np.diff(felt[order], append=felt[order[0]] + 2.0 * np.pi)
+    last = np.flatnonzero(turn > np.sqrt(2.0 * SAME_NORMAL))  # of each group of equal normals
+    G = len(last)
+    if G < 2:
+        return np.zeros((0, 2)), np.zeros(0)
+    group = np.empty(len(felt), dtype=int)
+    group[order] = np.searchsorted(last, np.arange(len(felt))) % G
+    normal, h = n[order[last]], (n[order[last]] * x[order[last]]).sum(axis=1)
+    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
+    along = (x * tangent[group]).sum(axis=1)
+    low, high = np.full(G, np.inf), np.full(G, -np.inf)
+    np.minimum.at(low, group, along)
+    np.maximum.at(high, group, along)
+    first = np.append(last[-1] + 1 - len(felt), last[:-1] + 1)  # of each group
+    spread = (felt[order[last]] - felt[order[first % len(felt)]]) % (2.0 * np.pi)
+    flat = high - low
+    flat[spread * FLATTER > flat] = 0.0
+    flat = np.where(flat > FLAT, np.bincount(group, minlength=G) - 1.0, 0.0)
+    a, b = np.arange(G), (np.arange(G) + 1) % G
+    a = a[(turn[last] < CORNER) & (flat[a] + flat[b] > 0.0)]
+    b, half = (a + 1) % G, 0.5 * turn[last[a]]
+    planes = np.stack([normal[a], normal[b]], axis=1)
+    solved = np.linalg.solve(
+        planes, np.stack([[h[a], h[b]], np.ones((2, len(a)))], -1).swapaxes(0, 1)
+    )
+    corner, inward = solved[..., 0], solved[..., 1]
+    to_a = np.maximum((corner * tangent[a]).sum(axis=1) - high[a], SLACK)
+    to_b = np.maximum(low[b] - (corner * tangent[b]).sum(axis=1), SLACK)
+    sharp = SHARPER ** np.minimum(flat[a] + flat[b], 30.0)
+    sharp = sharp * np.minimum(to_a, to_b) / np.tan(half)
+    c = corner - sharp[:, None] * inward
+    behind = (c @ n.T + sharp[:, None] < (n * x).sum(axis=1) + 1e-5).all(axis=1)
+    return c[behind], sharp[behind]
