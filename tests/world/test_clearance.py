@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny_hand import change
 
-from hqp_grasp.world.clearance import SelfClearance
+from hqp_grasp.world.clearance import LinkBalls, SelfClearance
 from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.robot import Robot, compiled
 
@@ -160,3 +160,52 @@ def test_collisions_are_the_pairs_that_overlap(tmp_path):
     links = SelfClearance(robot(tmp_path), 0.005)
     for slide, names in ((0.15 - 2e-6, ()), (0.15 + 2e-6, (("left", "right"),))):
         assert links.collisions(np.array([0.3, slide, 0.0, 0.0])) == names
+
+
+# ---------------------------------------------------------------- links as balls
+
+
+def test_links_as_balls_leave_out_what_touches_and_keep_a_balls_own_size(tmp_path):
+    arms = robot(tmp_path)
+    balls = LinkBalls(arms)
+    names = {arms.model.body(int(b)).name for b in balls.bodies}
+    assert "left" in names and "right" in names and "paddle" not in names  # the paddle touches
+    at = [i for i, b in enumerate(balls.bodies) if arms.model.body(int(b)).name == "left"]
+    assert balls.radii[at] == pytest.approx([0.02])
+    np.testing.assert_allclose(balls.centers[at], 0.0, atol=1e-12)
+
+
+def test_a_capsule_is_the_balls_along_it(tmp_path):
+    """Ends where the capsule ends; every point of its axis is within half a radius of a ball."""
+    xml = XML.replace(
+        '<geom name="right" type="sphere" size="0.03"/>',
+        '<geom name="right" type="capsule" fromto="0.01 0.02 0 0.01 0.02 0.12" size="0.03"/>',
+    )
+    arms = robot(tmp_path, xml)
+    balls = LinkBalls(arms)
+    at = [i for i, b in enumerate(balls.bodies) if arms.model.body(int(b)).name == "right"]
+    c = balls.centers[at]
+    assert balls.radii[at] == pytest.approx([0.03] * len(at))
+    np.testing.assert_allclose(c[:, :2], [[0.01, 0.02]] * len(at), atol=1e-9)
+    assert c[:, 2].min() == pytest.approx(0.0, abs=1e-9)
+    assert c[:, 2].max() == pytest.approx(0.12, abs=1e-9)
+    assert np.diff(np.sort(c[:, 2])).max() <= 0.03 + 1e-9
+
+
+def test_links_are_as_deep_as_the_deepest_ball_is_in_the_half_spaces(tmp_path):
+    arms = robot(tmp_path)
+    balls, q = LinkBalls(arms), np.array([0.3, 0.05, 0.0, 0.4])[: arms.n]
+    data = arms._at(q)
+    centers = np.array(
+        [
+            data.xpos[b] + data.xmat[b].reshape(3, 3) @ c
+            for b, c in zip(balls.bodies, balls.centers, strict=True)
+        ]
+    )
+    u = np.array([[0.0, 0.0, 1.0]])
+    for height in (-1.0, 0.05, 1.0):
+        deepest = (balls.radii + height - centers[:, 2]).max()
+        assert balls.depth(q, u, np.array([height])) == pytest.approx(deepest, abs=1e-12)
+    cube = np.vstack([np.eye(3), -np.eye(3)])
+    side = np.array([0.5, 0.5, -0.9, 0.5, 0.5, 1.0])  # 0.9 m below: nothing is there
+    assert balls.depth(q, cube, side) < 0.0
