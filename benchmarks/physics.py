@@ -291,10 +291,8 @@ def wrong_model(trials: int = 20, probes: int = 15, seed: int = 104) -> None:
     right = trial_of(thing, hg.Physics(), probes)
     cases["nothing wrong"] = right, None
     for factor in (0.25, 4.0):
-        stack = (
-            hg.ForceTask(radius=factor * 0.05) >> hg.MomentTask() >> hg.KinematicTask()
-        ).within(*right.stack.limits)
-        cases[f"sphere radius × {factor:g}"] = replace(right, stack=stack), None
+        form = hg.HierarchyForm(size=factor * 0.05)
+        cases[f"object's size × {factor:g}"] = replace(right, form=form), None
     offset = hg.Imperfections(arm_offset=np.radians(1.0))
     cases["arm off by 1°"] = replace(right, probe=hg.Physics(imperfections=offset)), None
     for friction in (0.3, 0.9, 1.2):
