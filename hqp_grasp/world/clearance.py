@@ -9,6 +9,7 @@ from itertools import combinations
 import mujoco
 import numpy as np
 
+from hqp_grasp.kernels import njit
 from hqp_grasp.world.robot import Robot
 
 TOUCHES = 1e-6  # [m] links nearer than this touch
@@ -37,6 +38,9 @@ class SelfClearance:
     least: float  # [m]
     pairs: np.ndarray = field(init=False)  # (p, 2) geom ids
     _least: np.ndarray = field(init=False, repr=False)  # (p,) [m]
+    _names: tuple[tuple[str, str], ...] = field(init=False, repr=False)  # p of them
+    _balls: np.ndarray = field(init=False, repr=False)  # (p,) [m] both geoms' bounding radii
+    _turns: np.ndarray = field(init=False, repr=False)  # (p, N) ±1: the joint moves one of the two
     at_home: tuple[tuple[str, str], ...] = field(init=False)  # pairs that touch there
 
     def __post_init__(self) -> None:
@@ -46,38 +50,44 @@ class SelfClearance:
         robot.place(data, robot.home)
         far = 2.0 * self.least
         home = np.full(len(pairs), far)
-        for i in np.flatnonzero(_bound(model, data, pairs) < far):
+        balls = np.where(model.geom_rbound > 0.0, model.geom_rbound, np.inf)  # 0: a plane
+        balls = balls[pairs].sum(axis=1)
+        for i in _close(data.geom_xpos, pairs, balls, far):
             home[i] = mujoco.mj_geomDistance(model, data, *map(int, pairs[i]), far, None)
         apart = home > TOUCHES
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
         put("pairs", pairs[apart])
         put("_least", np.minimum(self.least, 0.5 * home[apart]))
-        put("at_home", tuple(_names(model, pair) for pair in pairs[~apart]))
+        put("_names", _names(model, pairs[apart]))
+        put("_balls", balls[apart])
+        one, other = _movers(model)[model.geom_bodyid[pairs[apart].T]]
+        put("_turns", 1.0 * one - other)
+        put("at_home", _names(model, pairs[~apart]))
 
     def near(self, q: np.ndarray, within: float) -> Clearances:
         """The pairs nearer than `within` [m] at q (n,)."""
         robot, model = self.robot, self.robot.model
         data = robot._at(q)
-        mujoco.mj_comPos(model, data)
-        names, distances, least, rows = [], [], [], []
-        for i in np.flatnonzero(_bound(model, data, self.pairs) < within):
-            one, other = map(int, self.pairs[i])
-            ends = np.zeros(6)
-            distance = mujoco.mj_geomDistance(model, data, one, other, within, ends)
-            away = ends[:3] - ends[3:]
-            length = float(np.linalg.norm(away))
-            if distance >= within or length < TOUCHES:
-                continue
-            J = np.zeros((2, 3, model.nv))
-            for J_end, end, geom in zip(J, (ends[:3], ends[3:]), (one, other), strict=True):
-                body = int(model.geom_bodyid[geom])
-                mujoco.mj_jac(model, data, J_end, None, end, body)
-            names.append(_names(model, self.pairs[i]))
-            distances.append(distance)
-            least.append(self._least[i])
-            rows.append(np.sign(distance) * away / length @ (J[0] - J[1]) @ robot.coupling)
+        close = _close(data.geom_xpos, self.pairs, self._balls, within)
+        ends = np.zeros((len(close), 6))
+        distance = np.array(
+            [
+                mujoco.mj_geomDistance(model, data, one, other, within, both)
+                for (one, other), both in zip(self.pairs[close].tolist(), ends, strict=True)
+            ]
+        )
+        away = ends[:, :3] - ends[:, 3:]
+        length = np.sqrt((away * away).sum(axis=1))
+        seen = (distance < within) & (length >= TOUCHES)
+        close, distance = close[seen], distance[seen]
+        u = away[seen] * (np.sign(distance) / length[seen])[:, None]
+        # Both ends are on the line along u, where a joint moves one as fast as the other.
+        rate = _along(model, data, ends[seen, :3], u) * self._turns[close]
         return Clearances(
-            tuple(names), np.array(distances), np.array(least), np.reshape(rows, (-1, robot.n))
+            tuple([self._names[i] for i in close.tolist()]),
+            distance,
+            self._least[close],
+            rate @ robot.coupling,
         )
 
     def collisions(self, q: np.ndarray) -> tuple[tuple[str, str], ...]:
@@ -158,13 +168,50 @@ def _pairs(robot: Robot) -> np.ndarray:
     return np.reshape(pairs, (-1, 2)).astype(int)
 
 
-def _bound(model: mujoco.MjModel, data: mujoco.MjData, pairs: np.ndarray) -> np.ndarray:
-    """Distances (p,) [m] that the pairs are at least apart by."""
-    one, other = pairs.T
-    centres = np.linalg.norm(data.geom_xpos[one] - data.geom_xpos[other], axis=1)
-    return centres - model.geom_rbound[one] - model.geom_rbound[other]
+@njit(cache=True, error_model="numpy")
+def _close(centre, pairs, balls, within):  # type: ignore[no-untyped-def]
+    """The pairs whose bounding balls are nearer than `within` [m]: others cannot be.
+
+    `centre` (g, 3) [m] of the geoms' balls, `balls` (p,) [m] the radii of each pair, added up.
+    """
+    found = np.empty(len(pairs), np.int64)
+    count = 0
+    for i in range(len(pairs)):
+        one, other = pairs[i, 0], pairs[i, 1]
+        reach = within + balls[i]
+        square = 0.0
+        for a in range(3):
+            square += (centre[one, a] - centre[other, a]) ** 2
+        if square < reach * reach:
+            found[count] = i
+            count += 1
+    return found[:count]
 
 
-def _names(model: mujoco.MjModel, pair: np.ndarray) -> tuple[str, str]:
-    one, other = (model.geom(int(g)).name for g in pair)
-    return one, other
+def _along(model: mujoco.MjModel, data: mujoco.MjData, p: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """How fast each joint moves what it carries at p (m, 3) [m] along u (m, 3): (m, N) [m/rad].
+
+    a for a slide, and for a hinge u·(a × (p − c)) = a·(p × u) + u·(c × a).
+    """
+    a, c = data.xaxis, data.xanchor
+    hinge = (model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE))[:, None]
+    straight = np.where(hinge, _cross(c, a), a)
+    return u @ straight.T + _cross(p, u) @ (a * hinge).T
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b of rows (m, 3)."""
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
+
+
+def _movers(model: mujoco.MjModel) -> np.ndarray:
+    """(b, N) bool: which joints move each body."""
+    moves = np.zeros((model.nbody, model.njnt), dtype=bool)
+    for body in range(1, model.nbody):  # what carries a body comes before it
+        moves[body] = moves[model.body_parentid[body]]
+        moves[body] |= model.jnt_bodyid == body
+    return moves
+
+
+def _names(model: mujoco.MjModel, pairs: np.ndarray) -> tuple[tuple[str, str], ...]:
+    return tuple((model.geom(one).name, model.geom(other).name) for one, other in pairs.tolist())

@@ -1,14 +1,16 @@
 """Links of one robot that come near one another: which pairs, how near, and how that changes."""
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
+import mujoco
 import numpy as np
 import pytest
 from tiny_hand import change
 
 from hqp_grasp.world.clearance import LinkBalls, SelfClearance
 from hqp_grasp.world.description import RobotDescription
-from hqp_grasp.world.robot import Robot, compiled
+from hqp_grasp.world.robot import Robot, compiled, described
 
 STEP = 1e-6  # [rad, m]
 # Two arms on a base: a slide with a hinge, and a hinge with its follower. A post stands beside.
@@ -160,6 +162,80 @@ def test_collisions_are_the_pairs_that_overlap(tmp_path):
     links = SelfClearance(robot(tmp_path), 0.005)
     for slide, names in ((0.15 - 2e-6, ()), (0.15 + 2e-6, (("left", "right"),))):
         assert links.collisions(np.array([0.3, slide, 0.0, 0.0])) == names
+
+
+# ---------------------------------------------------------------- nothing is overlooked
+
+
+@pytest.fixture(scope="module")
+def torso():
+    """Two arms, two hands: some 900 pairs."""
+    about = described("umass_torso")
+    return SelfClearance(Robot(about, compiled(about)), about.clearance)
+
+
+def postures(torso, count):
+    """At work, and anywhere: (count, n) each."""
+    rng, robot = np.random.default_rng(0), torso.robot
+    around = robot.home + 0.2 * rng.normal(size=(count, robot.n))
+    anywhere = rng.uniform(robot.q_lower, robot.q_upper, (count, robot.n))
+    return [*np.clip(around, robot.q_lower, robot.q_upper), *anywhere]
+
+
+def one_by_one(links, q, within):
+    """Every pair measured by itself, and MuJoCo's own Jacobians: name, distance, gradient."""
+    robot, model = links.robot, links.robot.model
+    data = mujoco.MjData(model)
+    robot.place(data, q)
+    mujoco.mj_comPos(model, data)
+    for pair in links.pairs.tolist():
+        ends = np.zeros(6)
+        distance = mujoco.mj_geomDistance(model, data, *pair, within, ends)
+        if distance >= within:
+            continue
+        J = np.zeros((2, 3, model.nv))
+        for J_end, end, geom in zip(J, (ends[:3], ends[3:]), pair, strict=True):
+            mujoco.mj_jac(model, data, J_end, None, end, model.geom_bodyid[geom])
+        u = np.sign(distance) * (ends[:3] - ends[3:])
+        gradient = u / np.linalg.norm(u) @ (J[0] - J[1]) @ robot.coupling
+        yield tuple(model.geom(g).name for g in pair), distance, gradient
+
+
+@pytest.mark.parametrize("within", [0.0, 0.04, 0.3])
+def test_pairs_are_those_found_one_by_one_with_their_distances_and_gradients(torso, within):
+    seen = 0
+    for q in postures(torso, 40):
+        near, expected = torso.near(q, within), list(one_by_one(torso, q, within))
+        assert near.names == tuple(name for name, _, _ in expected)
+        assert near.distance.tolist() == [distance for _, distance, _ in expected]
+        rows = np.reshape([gradient for _, _, gradient in expected], (-1, torso.robot.n))
+        np.testing.assert_allclose(near.jacobian, rows, rtol=0.0, atol=1e-12)
+        seen += len(expected)
+    assert seen >= 10
+
+
+def test_pairs_found_do_not_depend_on_what_was_asked_before_nor_on_the_thread(torso):
+    some = postures(torso, 20)
+    alone = [SelfClearance(torso.robot, torso.least).near(q, 0.04) for q in some]
+    with ThreadPoolExecutor(4) as threads:
+        for q, near, expected in zip(
+            some * 3, threads.map(lambda q: torso.near(q, 0.04), some * 3), alone * 3, strict=True
+        ):
+            assert near.names == expected.names, q
+            np.testing.assert_array_equal(near.distance, expected.distance)
+            np.testing.assert_array_equal(near.jacobian, expected.jacobian)
+
+
+def test_a_plane_of_the_robots_base_is_near_wherever_it_reaches(tmp_path):
+    """It has no ball around it: its centre says nothing."""
+    plane = '<geom name="deck" type="plane" size="1 1 1" pos="3 0 -0.2"/>'
+    xml = change(XML, '<geom name="base" type="sphere" size="0.04"/>', plane)
+    arms = robot(tmp_path, change(xml, '<joint name="yaw" axis="0 0 1" range="-3 3"/>', ""))
+    links = SelfClearance(arms, 0.005)
+    found = links.near(arms.home, 0.6)
+    near = dict(zip(found.names, found.distance, strict=True))
+    height = arms._at(arms.home).geom("ball").xpos[2] + 0.2
+    assert near[("deck", "ball")] == pytest.approx(height - 0.02, abs=1e-9)
 
 
 # ---------------------------------------------------------------- links as balls
