@@ -135,9 +135,8 @@ class Judge:
         if robot.arm:
             way = carried(robot, bench.told, np.array([0.0, 0.0, self.lift]))
             if way is None:
-                return Judged(
-                    False, 0.0, bench.touching().normal_force.sum(), reason="out of reach"
-                )
+                total = float(bench.touching().normal_force.sum())
+                return Judged(False, 0.0, total, reason="out of reach")
             hand.follow(way, self.lift / LIFTING / len(way))
             rise = self.lift
         else:
