@@ -126,6 +126,23 @@ def test_the_interval_of_a_paired_difference_covers_it_as_often_as_it_says():
     assert 0.92 <= covered / 400 <= 0.98
 
 
+def test_a_paired_difference_has_its_covariance_in_its_interval():
+    """Agresti and Min: (b − c)/n' ± 1.96 √(b + c − (b − c)²/n')/n', with half a pair more each."""
+    for better, worse, both, neither in ((20, 5, 60, 15), (0, 30, 40, 30), (3, 3, 4, 0)):
+        one = [True] * worse + [False] * better + [True] * both + [False] * neither
+        other = [False] * worse + [True] * better + [True] * both + [False] * neither
+        n = better + worse + both + neither
+        difference, low, high = paired_difference(one, other)
+        assert difference == pytest.approx((better - worse) / n)
+        # The variance of a mean of n + 2 differences, each 1, 0 or −1.
+        pairs = np.repeat([1.0, -1.0, 0.0], [2 * better + 1, 2 * worse + 1, 2 * (both + neither + 1)])
+        width = 1.96 * pairs.std() / np.sqrt(n + 2)
+        assert (high + low) / 2 == pytest.approx(pairs.mean())
+        assert (high - low) / 2 == pytest.approx(width)
+    assert paired_difference([True] * 2, [False] * 2)[1] == -1.0  # no share is more than all
+    assert paired_difference([False] * 2, [True] * 2)[2] == 1.0
+
+
 def test_a_report_counts_pairs_and_names_who_failed(tmp_path):
     one = write(tmp_path / "one", TRIALS.values())
     other = write(tmp_path / "other", [[BALANCED] * 4] * 5)

@@ -10,7 +10,7 @@ import tiny_hand
 from starts import AWKWARD, begin
 
 from hqp_grasp.errors import InputError, ReachError
-from hqp_grasp.experiments.start import ALIKE, MAX_PLACES, SHIFT, TURN, Start
+from hqp_grasp.experiments.start import Start, _extent, _Place, _reach
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.hierarchy.hqp import HQP
@@ -19,6 +19,8 @@ from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
 SEEDS = range(3)
+PLACES, ALIKE = 24, 50  # of the palm in a draw; draws that all fail alike
+SHIFT, TURN = 0.01, np.radians(15.0)  # [m], [rad] away from an end
 POSE_TOL = 2e-4  # [m], [rad]: twice what the arm's posture is solved to
 
 
@@ -126,7 +128,7 @@ def test_a_draw_is_given_up_when_no_place_of_the_palm_helps():
     told = Told(then=above)
     with pytest.raises(ReachError, match=r"1 drawn .*finger_2 meets an edge or an end"):
         first_touch(scene, told, np.random.default_rng(5), Start(max_draws=1))
-    assert len(told.targets) == MAX_PLACES
+    assert len(told.targets) == PLACES
 
 
 def test_nearly_every_draw_is_followed_to_a_first_touch(scene, probe):
@@ -303,6 +305,20 @@ def test_draws_that_fail_for_several_reasons_go_on_to_the_last():
     assert sorted(told.value.reasons.values()) == [1, ALIKE + 19]
 
 
+def test_the_three_most_common_reasons_are_told_the_commonest_first():
+    kinds = [Miss.INSIDE] * 4 + [Miss.OWN_LINK] * 2 + [Miss.STUCK] + [Miss.TABLE] * 3
+    told = Told(*[Missed(kind, "finger_1") for kind in kinds])
+    with pytest.raises(ReachError) as error:
+        first_touch(Scene("bhand"), told, np.random.default_rng(0), Start(max_draws=10))
+    reasons = str(error.value).partition("postures (")[2]
+    assert [reason.partition(" (")[0] for reason in reasons.split("; ")[:3]] == [
+        f"4 {Miss.INSIDE.value}",
+        f"3 {Miss.TABLE.value}",
+        f"2 {Miss.OWN_LINK.value}",
+    ]
+    assert Miss.STUCK.value not in str(error.value) and "take a smaller one" in str(error.value)
+
+
 def test_a_start_after_many_draws_that_failed_alike_is_still_found(starts):
     scene, inside = Scene("bhand"), Missed(Miss.INSIDE, "finger_1")
     told = Told(*[inside] * (ALIKE - 1), then=starts[0].grasp)
@@ -330,6 +346,69 @@ def test_a_hand_without_an_arm_is_placed_where_the_draw_says(seed):
     assert abs(lever[0] * R[1, 2] - lever[1] * R[0, 2]) < 1e-9  # it faces the object's axis
     again = GeometricProbe(found.scene).touch(found.grasp.q)
     np.testing.assert_allclose(again.positions, found.grasp.positions, atol=1e-8)
+
+
+def test_by_default_a_start_is_the_papers():
+    start = Start()
+    np.testing.assert_allclose(np.degrees(start.adduction), [10.0, 90.0])
+    np.testing.assert_allclose(np.degrees(start.elevation), [30.0, 50.0])
+    assert start.offset == (-0.18, 0.18)
+    assert (start.advance, start.max_draws) == (0.01, 500)
+    assert Start(adduction=(0.5, 0.5)).adduction == (0.5, 0.5)  # one value is a range too
+
+
+# ---------------------------------------------------------------- where the palm is
+
+MIDDLE = np.array([0.5, -0.2, 0.3])
+
+
+@pytest.mark.parametrize("heading", [-2.0, 0.4])
+@pytest.mark.parametrize("elevation", [0.6, -0.1])
+def test_a_palm_faces_a_point_above_the_middle_from_its_distance(heading, elevation):
+    place = _Place(elevation, heading, 0.25, height=0.03)
+    z = place.approach
+    level = np.cos(elevation)
+    due = [level * np.cos(heading), level * np.sin(heading), -np.sin(elevation)]
+    np.testing.assert_allclose(z, due)
+    np.testing.assert_allclose(place.position(MIDDLE) + 0.25 * z, MIDDLE + [0.0, 0.0, 0.03])
+    assert _Place(elevation, heading, 0.25).height == _Place(elevation, heading, 0.25).turn == 0.0
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, -1.2])
+def test_a_palm_turns_about_its_approach_from_where_its_first_axis_is_level(turn):
+    """Of both level directions, the one nearer to how the palm is turned already."""
+    place = _Place(0.6, 0.4, 0.25, turn=turn)
+    z, level = place.approach, np.array([-np.sin(0.4), np.cos(0.4), 0.0])
+    for sign in (1.0, -1.0):
+        R = place.rotation(np.column_stack([sign * (level + 0.5 * z), z, z]))
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        np.testing.assert_allclose(R[:, 2], z)
+        x = sign * level
+        np.testing.assert_allclose(
+            R[:, 0], np.cos(turn) * x + np.sin(turn) * np.cross(z, x), atol=1e-12
+        )
+    R = place.rotation(np.column_stack([z, level, z]))  # neither is nearer: still a rotation
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_fingers_reach_as_far_before_the_palm_as_the_worst_of_their_tips(scene):
+    """The farthest that each gets while it closes, its radius counted."""
+    robot = scene.articulated
+    q = robot.opened(robot.home)
+    p, R = robot.palm(q)
+    ahead = [
+        ((robot.centers(robot.opened(q, share)) - p) @ R)[:, 2] + robot.tip_radius
+        for share in np.linspace(0.0, 1.0, 200)
+    ]
+    assert _reach(robot, q) == pytest.approx(np.max(ahead, axis=0).min(), abs=1e-3)
+    assert 0.0 <= np.max(ahead, axis=0).min() - _reach(robot, q)
+
+
+def test_an_object_extends_as_far_as_its_farthest_geom():
+    assert _extent(Scene(object=Cylinder(0.05, height=0.12))) == pytest.approx(np.hypot(0.05, 0.06))
+    wide = _extent(Scene(object=Prism.regular(6, 0.05)))
+    assert np.hypot(0.05, 0.06) <= wide < 0.2
 
 
 @pytest.mark.parametrize(

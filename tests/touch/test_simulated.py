@@ -819,3 +819,99 @@ def test_a_silent_caller_stops_a_hand_that_moves_closes_or_presses_after_the_wat
     assert hand.wait(0.5).fault == read.fault  # until it is moved again
     hand = high(scene, watchdog=0.3)
     assert hand.wait(0.7).fault == ""  # it stood
+
+
+def test_holding_takes_half_of_the_forces_error_away_within_its_speed_and_lead(scene):
+    hand = hg.SimulatedHand(scene)
+    hand.place(CLOSED)
+    q, way, i = hand._goal.copy(), hand._closing[1], 1
+    hand._give[i], hand._force[i], hand._aim[i] = 1e-3, 1.0, 1.0
+    lasts = 25 * 0.002
+    np.testing.assert_allclose(hand._correction(i, 0.8, q, 25), way * 1e-3 * 0.5 * 0.2)
+    np.testing.assert_allclose(hand._correction(i, 1.6, q, 25), way * 1e-3 * 0.5 * -0.6)
+    # The aim follows by 5 N/s; half of what it gains in a cycle is expected to be felt at its end.
+    hand._force[i] = 2.0
+    np.testing.assert_allclose(hand._correction(i, 1.0, q, 25), way * 1e-3 * (0.125 + 0.125))
+    assert hand._aim[i] == pytest.approx(1.0 + 5.0 * lasts)
+    hand._give[i], hand._aim[i] = 1.0, 2.0
+    np.testing.assert_allclose(hand._correction(i, 0.0, q, 25), way * 0.3 * lasts)
+    np.testing.assert_allclose(hand._correction(i, 9.0, q, 25), way * -0.3 * lasts)
+    # A target leads its joint by twice the give at the held force, and what counts as stalled.
+    hand._give[i] = 1e-3
+    behind = q - 0.018 * way
+    np.testing.assert_allclose(hand._correction(i, 0.0, behind, 25), way * (0.004 + 0.015 - 0.018))
+    still = hand._correction(i, 0.0, q, 25) * (way == 0.0)
+    assert not still.any()
+
+
+def test_edges_do_not_creep_while_a_hand_presses_and_objects_do_not_shake_before(scene):
+    """MuJoCo's ten iterations without slip are on for as long as something is held."""
+    hand = hg.SimulatedHand(scene)
+    hand.place(CLOSED)
+    on = [hand.model.opt.noslip_iterations]
+    hand.press(np.zeros(3))
+    on.append(hand.model.opt.noslip_iterations)
+    hand.stop()
+    on.append(hand.model.opt.noslip_iterations)
+    assert on == [0, 10, 0]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_finger_that_touches_or_stalls_first_is_the_one_that_is_told(scene, first):
+    def closing():
+        hand = hg.SimulatedHand(scene)
+        hand.place(CLOSED)
+        for i in range(2):
+            hand.close(i, 0.5, 0.8)
+        state, sensors = hand._run(hand._plan(25))
+        wrench = np.random.default_rng(0).normal(scale=1e-4, size=(25, 2, 6))
+        return hand, state, wrench
+
+    hand, state, wrench = closing()
+    wrench[10:, first, :3] += hand._zero[first] + [0.0, 0.9, 0.0]
+    wrench[15:, 1 - first, :3] += hand._zero[1 - first] + [0.0, 0.9, 0.0]
+    wrench[5, 1 - first, :3] += 50.0  # a spike is nothing
+    assert hand._react(state, wrench, np.zeros((25, 3))) == 12
+    assert hand._touched.tolist() == [first == 0, first == 1] and not hand._stalled.any()
+    hand, state, wrench = closing()
+    goal = hand._planned[0]
+    for finger, begin in ((first, 10), (1 - first, 15)):
+        at = hand._q[1 + finger]
+        state[begin:, at] = goal[begin:, 1 + finger] - 0.1
+    assert hand._react(state, wrench, np.zeros((25, 3))) == 11
+    assert hand._stalled.tolist() == [first == 0, first == 1] and not hand._touched.any()
+
+
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_of_joints_that_do_not_follow_the_one_farthest_behind_is_named(scene, joint):
+    hand = high(scene)
+    hand.move(np.array([0.2, 0.3, 0.3]), 0.5)
+    state, _ = hand._run(hand._plan(50))
+    for j in range(3):
+        state[20:, hand._q[j]] += 0.2 if j == joint else -0.06
+    wrench = np.random.default_rng(0).normal(scale=1e-4, size=(50, 2, 6))
+    assert hand._react(state, wrench, np.zeros((50, 3))) == 21
+    name = ("lift", "left", "right")[joint]
+    assert hand._fault == f"something holds {name}: it does not follow"
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_the_tip_that_meets_something_is_named_and_so_is_the_joint_that_runs_away(scene, finger):
+    hand = high(scene)
+    hand.move(np.array([0.2, 0.3, 0.3]), 0.5)
+    state, _ = hand._run(hand._plan(50))
+    wrench = np.random.default_rng(0).normal(scale=1e-4, size=(50, 2, 6))
+    wrench[20:, finger, 0] = 5.0
+    assert hand._react(state, wrench, np.zeros((50, 3))) == 22
+    name = ("left", "right")[finger]
+    assert hand._fault.endswith(f"at {name} finger")
+    hand = high(scene)
+    hand.press(np.array([0.0, 0.4, 0.4]))
+    state, _ = hand._run(hand._plan(25))
+    motors = np.full((25, 3), 0.4)
+    motors[:, 1 + finger] = 0.0
+    for _ in range(20):
+        hand._react(state, np.zeros((25, 2, 6)), motors)
+        if hand._fault:
+            break
+    assert hand._fault == f"{name} meets nothing that resists what it presses with"
