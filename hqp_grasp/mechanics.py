@@ -33,22 +33,24 @@ def tangents(normals: np.ndarray) -> np.ndarray:
     level, and the second upright, so that pyramids carry weights by an edge.
     """
     least = np.abs(normals).argmin(axis=-1)
-    first = _cross(normals, np.eye(3)[least])
+    first = cross(normals, np.eye(3)[least])
     first /= np.sqrt((first * first).sum(axis=-1, keepdims=True))
-    return np.stack([first, _cross(normals, first)], axis=-2)
+    return np.stack([first, cross(normals, first)], axis=-2)
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """a × b along the last axis; np.cross costs several times as much on small arrays."""
-    x, y, z = np.moveaxis(a, -1, 0)
-    u, v, w = np.moveaxis(b, -1, 0)
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    out = np.empty((*np.broadcast(a[..., 0], b[..., 0]).shape, 3))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
 
 
 def net_wrench(forces: np.ndarray, positions: np.ndarray, about: np.ndarray) -> np.ndarray:
     """Σ f_i and Σ (x_i − c) × f_i, (…, 6) [N, N·m], of forces (…, k, 3), about c (…, 3) [m]."""
     lever = positions - about[..., None, :]
-    return np.concatenate([forces.sum(axis=-2), _cross(lever, forces).sum(axis=-2)], axis=-1)
+    return np.concatenate([forces.sum(axis=-2), cross(lever, forces).sum(axis=-2)], axis=-1)
 
 
 def grasp_map(positions: np.ndarray, about: np.ndarray) -> np.ndarray:

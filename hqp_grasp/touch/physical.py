@@ -10,6 +10,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, finite, instance, positive
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
+from hqp_grasp.mechanics import cross
 from hqp_grasp.touch.driver import Driver, Readings, require_touch
 from hqp_grasp.touch.geometric import RETREAT
 from hqp_grasp.touch.sensing import sense
@@ -414,4 +415,4 @@ def weight(load: tuple[np.ndarray, np.ndarray], R_world_tip: np.ndarray) -> np.n
     """Gravity's wrench (k, 6) on each tip about its centre, in its frame."""
     masses, middles = load
     force = masses[:, None] * (GRAVITY @ R_world_tip)
-    return np.concatenate([force, np.cross(middles, force)], axis=1)
+    return np.concatenate([force, cross(middles, force)], axis=1)

@@ -12,6 +12,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, ModelError, instance
 from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.mechanics import cross
 from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import (
     SLIDE_SPEED,
@@ -374,7 +375,7 @@ class Robot:
         data = self._at(q)
         J = self._point_jacobian(data, points)  # (k, N, 3)
         omega = data.xaxis * self._hinge[:, None]
-        both = self._nearer_base[None, :, :, None] * _cross(omega[None, :, None], J[:, None, :])
+        both = self._nearer_base[None, :, :, None] * cross(omega[None, :, None], J[:, None, :])
         both *= self._ancestor[:, :, None, None]
         H = both.transpose(0, 3, 1, 2)
         diagonal = np.einsum("kajj->kaj", H).copy()
@@ -385,7 +386,7 @@ class Robot:
 
     def _point_jacobian(self, data: mujoco.MjData, points: np.ndarray | None) -> np.ndarray:
         lever = self._world(data, points)[:, None, :] - data.xanchor[None]
-        J = np.where(self._hinge[:, None], _cross(data.xaxis[None], lever), data.xaxis)
+        J = np.where(self._hinge[:, None], cross(data.xaxis[None], lever), data.xaxis)
         return J * self._ancestor[:, :, None]
 
     def _world(self, data: mujoco.MjData, points: np.ndarray | None) -> np.ndarray:
@@ -439,7 +440,7 @@ class Robot:
         """∂x/∂q (3, n) [m/rad] of a point of link i that is at x (3,) [m], world."""
         data = self._at(q)
         axes = data.xaxis
-        J = np.where(self._hinge[:, None], _cross(axes, x - data.xanchor), axes)
+        J = np.where(self._hinge[:, None], cross(axes, x - data.xanchor), axes)
         return (J * self._ancestor[i][:, None]).T @ self.coupling
 
     def tip_frames(self, q: np.ndarray) -> np.ndarray:
@@ -569,15 +570,6 @@ class Robot:
 def _times(blocks: np.ndarray, J: np.ndarray) -> np.ndarray:
     """Blocks (k, 3, 3), one a contact, times its three rows of J (3k, n)."""
     return np.asarray((blocks @ J.reshape(len(blocks), 3, -1)).reshape(J.shape))
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a × b along the last axis; np.cross costs several times as much on small arrays."""
-    out = np.empty((*np.broadcast(a[..., 0], b[..., 0]).shape, 3))
-    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return out
 
 
 def _id(

@@ -14,6 +14,8 @@ from hqp_grasp.touch.driver_contract import CHECKS, DriverError, Rig, check_driv
 # A posture from which every finger touches the cylinder, found by GeometricProbe.
 POSTURE = np.array([0.62, 1.12, -0.73, 1.96, 0.63, -0.41, 0.49, 0.21, 1.01, 0.99, 0.98])
 
+COARSE = hg.Physics(timestep=0.005)  # for what is broken: a fault shows all the same, and sooner
+
 
 @pytest.fixture(scope="module")
 def scene():
@@ -41,7 +43,7 @@ def rig(request, toy, scene, grasp):
 
     def make(broken):
         if request.param == "simulated":
-            return rig_of(broken(hg.SimulatedHand(scene)), scene, grasp)
+            return rig_of(broken(hg.SimulatedHand(scene, COARSE)), scene, grasp)
         hand = toy["ToyHand"]()
         hand.robot = toy["robot"]
         return Rig(broken(hand), toy["robot"], toy["free"], toy["q_open"], toy["normals"])
@@ -448,7 +450,7 @@ BROKEN = {
 )
 def test_a_broken_driver_is_refused_by_the_name_of_its_fault(scene, grasp, check, broken, says):
     with pytest.raises(DriverError, match=says):
-        check(rig_of(broken(hg.SimulatedHand(scene)), scene, grasp))
+        check(rig_of(broken(hg.SimulatedHand(scene, COARSE)), scene, grasp))
 
 
 class Sold(Broken):
@@ -634,7 +636,7 @@ def test_a_wrong_torque_of_the_wrench_shows_as_tips_are_dragged(scene, grasp, na
     fault = says("wrench", lambda x: x * np.repeat([1.0, scale], 3))
     with pytest.raises(DriverError, match=f"wrong torque of the wrench: .*{name}"):
         contract.wrenches_agree_with_all_else(
-            rig_of(Sold(hg.SimulatedHand(scene), **fault), scene, grasp)
+            rig_of(Sold(hg.SimulatedHand(scene, COARSE), **fault), scene, grasp)
         )
 
 
@@ -648,7 +650,7 @@ def test_a_watchdog_that_sleeps_while_the_arm_carries_is_found(scene, grasp):
 
     with pytest.raises(DriverError, match="does not end carrying"):
         contract.carrying_keeps_what_is_pressed(
-            rig_of(Carrier(hg.SimulatedHand(scene)), scene, grasp)
+            rig_of(Carrier(hg.SimulatedHand(scene, COARSE)), scene, grasp)
         )
 
 
@@ -694,7 +696,7 @@ def test_a_channel_spoilt_at_random_is_refused(scene, grasp):
             fault = says(channel, lambda x, by=by: x * by)
         else:
             fault = says(channel, lambda x, one=one, other=other: exchanged(x, 1, one, other))
-        rig = rig_of(Sold(hg.SimulatedHand(scene), **fault), scene, grasp)
+        rig = rig_of(Sold(hg.SimulatedHand(scene, COARSE), **fault), scene, grasp)
         with pytest.raises(DriverError):
             until_refused(rig)
 
@@ -715,7 +717,7 @@ def test_all_that_is_broken_is_told_at_once_and_a_refusal_is_no_way_out(scene, g
             raise hg.InputError("not today")
 
     with pytest.raises(DriverError) as told:
-        check_driver(rig_of(RefusesToPress(hg.SimulatedHand(scene)), scene, grasp))
+        check_driver(rig_of(RefusesToPress(hg.SimulatedHand(scene, COARSE)), scene, grasp))
     assert "time stamps do not advance" in str(told.value)
     assert "refused is what may be asked for (pressing ends): not today" in str(told.value)
 
