@@ -22,7 +22,7 @@ from hqp_grasp.experiments.record import Record
 from hqp_grasp.experiments.start import Start
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
+from hqp_grasp.grasp import Contact, Frame, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP, solvers
 from hqp_grasp.hierarchy.level import Level, LevelReport, Solution
 from hqp_grasp.hierarchy.projection import Projection
@@ -73,6 +73,7 @@ __all__ = [
     "ForceLaw",
     "ForceTask",
     "Forces",
+    "Frame",
     "GeometricProbe",
     "Grasp",
     "Grip",

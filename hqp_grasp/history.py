@@ -10,7 +10,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.files import digest, whole_file
-from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
+from hqp_grasp.grasp import Contact, Frame, Grasp, Miss, Missed, Touch
 
 FORMER = ("confidence",)  # of contacts in older files; nothing ever read it
 UNREADABLE = (  # what comes of JSON that holds something else
@@ -81,10 +81,11 @@ def _plain(touch: Touch) -> dict[str, object]:
         grasp = touch.felt
         felt = {name: _list(getattr(grasp, name)) for name in GRASP}
         felt["other_links"] = list(grasp.other_links)
-        felt["contacts"] = [
-            {name: _list(value) for name, value in vars(contact).items()}
-            for contact in grasp.contacts
-        ]
+        for several in ("contacts", "frames"):
+            felt[several] = [
+                {name: _list(value) for name, value in vars(each).items()}
+                for each in getattr(grasp, several)
+            ]
     return {"q_target": touch.q_target.tolist(), "felt": felt}
 
 
@@ -96,8 +97,12 @@ def _touch(plain: dict[str, dict[str, object]]) -> Touch:
         Contact(**{name: value for name, value in contact.items() if name not in FORMER})
         for contact in felt.pop("contacts")  # type: ignore[attr-defined]
     ]
+    frames = tuple(Frame(**frame) for frame in felt.pop("frames", ()))  # type: ignore[attr-defined]
     felt["other_links"] = tuple(felt["other_links"])  # type: ignore[arg-type]
-    return Touch(plain["q_target"], Grasp(contacts=tuple(contacts), **felt))  # type: ignore[arg-type]
+    return Touch(
+        plain["q_target"],  # type: ignore[arg-type]
+        Grasp(contacts=tuple(contacts), frames=frames, **felt),  # type: ignore[arg-type]
+    )
 
 
 def _list(value: object) -> object:

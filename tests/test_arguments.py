@@ -42,6 +42,12 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.DriverLimits: dict.fromkeys(("upper", "speed", "torque"), FOUR)
     | {"lower": -FOUR, "force": 1.0, "watchdog": 1.0},
     hg.ForceTask: {},
+    hg.Frame: {
+        "name": "palm",
+        "position": np.zeros(3),
+        "rotation": np.eye(3),
+        "jacobian": np.zeros((6, 2)),
+    },
     hg.Forces: {"priorities": ((NetForce(),),)},
     hg.GeometricProbe: {"scene": SCENE},
     hg.Grasp: GRASP,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hqp_grasp.errors import InputError
-from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.grasp import Contact, Frame, Grasp
 
 Z = np.array([0.0, 0.0, 1.0])
 N = 4
@@ -82,6 +82,57 @@ def test_noise_is_finite_and_not_negative(noise):
 def test_flexion_is_a_list_of_indices(flexion):
     with pytest.raises(InputError, match=r"Contact\.flexion"):
         contact(flexion=flexion)
+
+
+def test_closing_is_one_number_for_each_joint():
+    assert contact().closing is None
+    np.testing.assert_array_equal(contact(closing=[0, 1, -0.5]).closing, [0.0, 1.0, -0.5])
+    with pytest.raises(InputError, match=r"Contact\.closing must have shape \(any\)"):
+        contact(closing=np.eye(2))
+    with pytest.raises(InputError, match=r"Contact\.closing must be finite; entry \(1,\) is nan"):
+        contact(closing=[0.0, np.nan])
+    with pytest.raises(InputError, match=r"Contact\.closing must have shape \(4,\).*got \(3,\)"):
+        grasp(contacts=(contact(closing=np.zeros(N)), contact(closing=np.zeros(3))))
+
+
+# ---------------------------------------------------------------- frames
+
+
+def frame(**given):
+    usual = {
+        "name": "left",
+        "position": Z,
+        "rotation": np.eye(3),
+        "jacobian": np.ones((6, N)),
+    }
+    return Frame(**(usual | given))
+
+
+@pytest.mark.parametrize(
+    ("field", "size"),
+    [("position", r"\(3\)"), ("rotation", r"\(3, 3\)"), ("jacobian", r"\(6, any\)")],
+)
+def test_a_frames_arrays_have_their_shape_and_are_finite(field, size):
+    with pytest.raises(InputError, match=rf"Frame\.{field} must have shape {size}; got \(2, 2\)"):
+        frame(**{field: np.eye(2)})
+    bad = np.array(getattr(frame(), field))
+    bad.flat[-1] = np.inf
+    with pytest.raises(InputError, match=rf"Frame\.{field} must be finite"):
+        frame(**{field: bad})
+
+
+def test_a_grasp_has_a_frame_for_each_group_and_each_moves_with_its_joints():
+    assert grasp().frames == ()
+    both = grasp(frames=[frame(), frame(name="right")]).frames
+    assert [each.name for each in both] == ["left", "right"]
+    with pytest.raises(InputError, match=r"one frame for each group; .*'left', 'left'"):
+        grasp(frames=(frame(), frame()))
+    with pytest.raises(InputError, match=r"Frame\.jacobian of 'left' must have shape \(6, 4\)"):
+        grasp(frames=(frame(jacobian=np.ones((6, 3))),))
+    with pytest.raises(InputError, match=r"Grasp\.frames holds 'left'; it must hold Frame"):
+        grasp(frames=("left",))
+    with pytest.raises(InputError, match=r"Grasp\.frames must list Frame values; got 3"):
+        grasp(frames=3)
 
 
 # ---------------------------------------------------------------- grasps

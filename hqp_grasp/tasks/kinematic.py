@@ -1,4 +1,4 @@
-"""The kinematic law: each finger's flexion should push along the normal of its contact."""
+"""The kinematic law: closing a finger should push along the normal of its contact."""
 
 from __future__ import annotations
 
@@ -19,14 +19,17 @@ EQUAL_SPEEDS = 1e-6  # [–] relative difference of two singular values below wh
 
 @dataclass(frozen=True, init=False)
 class KinematicTask(Task):
-    """How far each flexion is from moving its contact along the normal (paper, section 2.3).
+    """How far closing is from moving its contact along the normal (paper, section 2.3).
 
-    With J_γ = ∂x_i/∂γ_i (3, g), the columns of contact i's Jacobian for its flexion joints γ_i:
+    With J_i = ∂x_i/∂q (3, n), w_i the contact's `closing` (n,), and J_γ = ∂x_i/∂γ_i (3, g) the
+    columns of its flexion joints γ_i:
 
-    - error="angle": ε_i = arccos(|n·J_γ|/|J_γ|) [rad] for one joint; for several, the angle
-      between n and the leading left singular vector of J_γ, the major axis of the velocity
-      ellipsoid and so the minor axis of the force ellipsoid. This is what section 2.3 asks for
-      and what Figure 3 plots.
+    - error="angle": ε_i = arccos(|n·J_i w_i|/|J_i w_i|) [rad], the angle between the normal and
+      the way the contact moves as it closes, whichever joints of finger or arm close it. For one
+      flexion joint that is arccos(|n·J_γ|/|J_γ|), as in Figure 3. For contacts that tell several
+      flexion joints and no closing, it is what section 2.3 asks for: the angle between n and the
+      leading left singular vector of J_γ, the major axis of the velocity ellipsoid and so the
+      minor axis of the force ellipsoid.
     - error="eq7": ε_i = (nᵀ J_γ J_γᵀ n)^½ [m/rad] (paper, eq. 7–8). Descending it does the
       opposite: the flexion turns tangent to the surface.
 
@@ -77,10 +80,10 @@ class KinematicTask(Task):
 
     def error(self, grasp: Grasp) -> np.ndarray:
         """ε_i of each contact (k,), [rad] for "angle", [m/rad] for "eq7"."""
-        return self._error_and_slope(grasp, _flexion_columns(grasp))[0]
+        return self._error_and_slope(grasp, self._ways(grasp))[0]
 
     def jacobian(self, grasp: Grasp) -> np.ndarray:
-        """∂ε_i/∂q (k, n): the terms of eq. 9, for γ_i of any dimension.
+        """∂ε_i/∂q (k, n): the terms of eq. 9, for γ_i of any dimension; w_i is held fixed.
 
         For one flexion joint and "eq7" this is eq. 10 with the sign(n·J_γ) that it lacks. A row
         is zero where its error is at its minimum, 0 (there ε_i has a kink and zero is one of its
@@ -106,47 +109,53 @@ class KinematicTask(Task):
         return self.weight * J, (-self.weight * self.gain) * e
 
     def _error_and_jacobian(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
-        """ε (k,) and ∂ε/∂q (k, n) = Σ over the entries of J_γ of ∂ε/∂J_γ · ∂J_γ/∂q."""
+        """ε (k,) and ∂ε/∂q (k, n), over the entries of J_i W_i: Σ ∂ε/∂(J_i W_i) · ∂J_i/∂q W_i."""
         if grasp.hessian is None:
             raise InputError(
                 "KinematicTask.jacobian needs second derivatives: build the Grasp with "
                 f"hessian = ∂²x/∂q² of shape {(3 * grasp.k, grasp.n, grasp.n)}"
             )
         k, n = grasp.k, grasp.n
-        gamma = _flexion_columns(grasp)
-        e, slope = self._error_and_slope(grasp, gamma)
-        dJ_gamma = grasp.hessian.reshape(k, 3, n, n)[np.arange(k)[:, None], :, gamma]  # (k,g,3,n)
-        J = slope.reshape(k, 1, -1) @ dJ_gamma.reshape(k, -1, n)  # (k, 1, n)
+        ways = self._ways(grasp)
+        e, slope = self._error_and_slope(grasp, ways)
+        dJW = (ways[:, None] @ grasp.hessian.reshape(k, 3, n, n)).swapaxes(1, 2)  # (k, g, 3, n)
+        J = slope.reshape(k, 1, -1) @ dJW.reshape(k, -1, n)
         return e, J[:, 0]
 
-    def _error_and_slope(self, grasp: Grasp, gamma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """ε (k,) and ∂ε/∂J_γᵀ (k, g, 3)."""
-        # J_γᵀ of every contact (k, g, 3). A repeated index pads γ_i; its row is set to zero,
-        # which changes neither error, and makes its slope zero too.
-        JT = grasp._of_links[np.arange(grasp.k)[:, None], :, gamma]
-        if gamma.shape[1] > 1:
-            JT[:, 1:][gamma[:, 1:] == gamma[:, :-1]] = 0.0
+    def _error_and_slope(self, grasp: Grasp, ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """ε (k,) and ∂ε/∂(J_i W_i)ᵀ (k, g, 3)."""
+        WTJT = ways @ grasp._of_links.swapaxes(1, 2)  # (k, g, 3)
         if self.kind == "eq7":
-            return _eq7(grasp.normals, JT)
-        return _angle(grasp, JT)
+            return _eq7(grasp.normals, WTJT)
+        return _angle(grasp, WTJT)
+
+    def _ways(self, grasp: Grasp) -> np.ndarray:
+        """Ways W_iᵀ (k, g, n) for q to go as each contact closes; what is left of g is zero.
+
+        One along `closing` for an angle where a contact tells it, else one for each flexion joint.
+        """
+        sets: list[list[np.ndarray]] = []
+        one = np.eye(grasp.n)
+        for i, contact in enumerate(grasp.contacts):
+            w = contact.closing if self.kind == "angle" else None
+            if w is not None and w.any():
+                sets.append([w / np.abs(w).max()])
+            elif w is None and contact.flexion:
+                sets.append([one[j] for j in sorted(set(contact.flexion))])
+            else:
+                raise InputError(
+                    f"KinematicTask: {_label(grasp, i)} has no flexion joint; give "
+                    "Contact.flexion the indices into q of the joints that press it"
+                )
+        ways = np.zeros((grasp.k, max(map(len, sets)), grasp.n))
+        for way, rows in zip(ways, sets, strict=True):
+            way[: len(rows)] = rows
+        return ways
 
 
 def is_kinematic(task: Task) -> TypeGuard[KinematicTask]:
     """Whether the paper's form has this law last, in joint space."""
     return isinstance(task, KinematicTask)
-
-
-def _flexion_columns(grasp: Grasp) -> np.ndarray:
-    """γ_i of every contact as one array (k, g): sorted, its last index repeated to length g."""
-    sets = [sorted(set(c.flexion)) for c in grasp.contacts]
-    for i, gamma in enumerate(sets):
-        if not gamma:
-            raise InputError(
-                f"KinematicTask: {_label(grasp, i)} has no flexion joint; give Contact.flexion "
-                "the indices into q of the joints that press it"
-            )
-    g = max(map(len, sets))
-    return np.array([gamma + gamma[-1:] * (g - len(gamma)) for gamma in sets])
 
 
 def _eq7(normals: np.ndarray, JT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

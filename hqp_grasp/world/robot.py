@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from hqp_grasp.errors import InputError, ModelError, instance
-from hqp_grasp.grasp import Contact, Grasp
+from hqp_grasp.grasp import Contact, Frame, Grasp
 from hqp_grasp.mechanics import cross
 from hqp_grasp.world.compiling import compiled_spec
 from hqp_grasp.world.description import (
@@ -495,9 +495,10 @@ class Robot:
 
         `contacts` has one Contact for each contact point, in the description's order: position and
         outward normal (world), perhaps wrench and noise; on a link that is no ball,
-        perhaps the `tip_radius` it is rounded by there, and its `stretch`. Name, link, point and
-        flexion are the robot's, and so are the grasp's Jacobian, Hessian and coupling; and the
-        position too on a ball felt with noise, for joint angles tell its centre.
+        perhaps the `tip_radius` it is rounded by there, and its `stretch`. Name, link, point,
+        group, flexion and closing are the robot's, and so are the grasp's Jacobian, Hessian,
+        coupling and frames; and the position too on a ball felt with noise, for joint angles tell
+        its centre.
         """
         q = self.require_q("Robot.grasp: q", q)
         points = self.description.contact_points
@@ -507,6 +508,7 @@ class Robot:
                 f"({', '.join(p.name for p in points)}); got {len(contacts)} contacts"
             )
         places, centers = self._points.copy(), self.centers(q)
+        hand = self.description.hand.name
         complete = []
         for i, (contact, point) in enumerate(zip(contacts, points, strict=True)):
             radius = float(self.tip_radius[i])
@@ -521,7 +523,9 @@ class Robot:
                     name=point.name,
                     body=self.model.body(int(self._bodies[i])).name,
                     point=places[i],
+                    group=hand,
                     flexion=self.flexion[i],
+                    closing=self.closing[i],
                     tip_radius=radius,
                 )
             )
@@ -539,6 +543,7 @@ class Robot:
             coupling=self.coupling,
             offset=self.offset,
             other_links=other_links,
+            frames=(Frame(hand, *self.palm(q), self.palm_jacobian(q)),),
         )
 
     @property

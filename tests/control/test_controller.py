@@ -20,7 +20,7 @@ from hqp_grasp.control.limits import (
 )
 from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
+from hqp_grasp.grasp import Contact, Frame, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.history import load_history, save_history
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, stack_of
@@ -105,6 +105,23 @@ def test_a_stored_history_keeps_every_field_of_grasps_and_misses(first, tmp_path
     for one, other in zip(back[0].felt.contacts, grasp.contacts, strict=True):
         for field in dataclasses.fields(Contact):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+    (there,), (here,) = back[0].felt.frames, grasp.frames
+    for field in dataclasses.fields(Frame):
+        np.testing.assert_array_equal(getattr(there, field.name), getattr(here, field.name))
+
+
+def test_a_history_from_before_grasps_had_groups_is_read(robot, stack, first, tmp_path):
+    path = tmp_path / "h.json"
+    save_history(path, [Touch(first.q, first)])
+    older = json.loads(path.read_text())["touches"]
+    del older[0]["felt"]["frames"]
+    for contact in older[0]["felt"]["contacts"]:
+        del contact["group"], contact["closing"]
+    path.write_text(json.dumps(older))
+    history = load_history(path)
+    assert history[0].felt.frames == () and history[0].felt.contacts[0].closing is None
+    step, now = (Controller(robot, stack).step(h) for h in (history, [Touch(first.q, first)]))
+    assert step.q_target.tobytes() == now.q_target.tobytes()
 
 
 def test_a_history_stored_with_a_field_that_contacts_no_longer_have_is_read(first, tmp_path):
@@ -380,10 +397,20 @@ def test_a_touch_holds_finite_joints_and_what_was_felt(first):
 def test_a_robots_grasp_is_the_one_that_its_probe_feels(robot, first):
     felt = [Contact(c.position, c.normal) for c in first.contacts]
     again = robot.grasp(first.q, felt)
+    names = [point.name for point in robot.description.contact_points]
+    closing = dict(zip(names, robot.closing, strict=True))
     for name in ("q", "jacobian", "hessian", "coupling", "offset", "positions", "normals"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     for one, other in zip(again.contacts, first.contacts, strict=True):
         assert (one.name, one.body, one.flexion) == (other.name, other.body, other.flexion)
+        assert one.group == "hand"
+        np.testing.assert_array_equal(one.closing, closing[one.name])
+    (frame,) = again.frames
+    position, rotation = robot.palm(first.q)
+    assert frame.name == "hand"
+    np.testing.assert_array_equal(frame.position, position)
+    np.testing.assert_array_equal(frame.rotation, rotation)
+    np.testing.assert_array_equal(frame.jacobian, robot.palm_jacobian(first.q))
     with pytest.raises(InputError, match=r"touches with 3 points .*got 2 contacts"):
         robot.grasp(first.q, felt[:2])
 

@@ -545,6 +545,71 @@ def test_gradient_form_asks_every_joint_to_descend(error: str, seed: int) -> Non
     assert task.potential(small.at(q, small.normals0, small.x0)) < task.potential(grasp)
 
 
+def with_closings(grasp: Grasp, closings: dict[int, np.ndarray]) -> Grasp:
+    contacts = [
+        dataclasses.replace(c, closing=closings.get(i)) for i, c in enumerate(grasp.contacts)
+    ]
+    return dataclasses.replace(grasp, contacts=tuple(contacts))
+
+
+@pytest.mark.parametrize("told", [(0, 1, 2), (0, 2), (1,)], ids=str)
+def test_a_contact_that_tells_its_closing_is_judged_by_the_way_it_moves_then(
+    told: tuple[int, ...], seed: int
+) -> None:
+    """Whatever joints close it, those of the arm among them; the others as before."""
+    world = World(seed, fingers=(2, 3, 1))
+    rng = np.random.default_rng(200 + seed)
+    closings = {i: rng.normal(size=world.hand.n) for i in told}
+    task = KinematicTask()
+
+    def at(q: np.ndarray) -> Grasp:
+        return with_closings(world.at(q, world.normals0, world.x0), closings)
+
+    grasp = at(world.q0)
+    error = task.error(grasp)
+    for i, w in closings.items():
+        v = grasp.contact_jacobian(i) @ w
+        cosine = abs(world.normals0[i] @ v) / np.linalg.norm(v)
+        assert error[i] == pytest.approx(math.acos(cosine), abs=1e-9)
+    for i in {0, 1, 2} - set(told):
+        assert error[i] == pytest.approx(task.error(world.grasp)[i], abs=EXACT)
+    fd = differences(lambda q: task.error(at(q)), world.q0)
+    np.testing.assert_allclose(task.jacobian(grasp), fd, atol=FD_TOL)
+
+
+def test_closing_has_a_direction_and_no_length_and_eq7_does_not_read_it(seed: int) -> None:
+    world = World(seed, fingers=(2, 3, 1))
+    rng = np.random.default_rng(300 + seed)
+    w = {i: rng.normal(size=world.hand.n) for i in range(3)}
+    one, other = (with_closings(world.grasp, {i: s * w[i] for i in w}) for s in (1.0, -1e-3))
+    for ask in (KinematicTask().error, KinematicTask().jacobian):
+        np.testing.assert_allclose(ask(one), ask(other), atol=EXACT * 1e2)
+    eq7 = KinematicTask("eq7")
+    np.testing.assert_array_equal(eq7.error(one), eq7.error(world.grasp))
+    np.testing.assert_array_equal(eq7.jacobian(one), eq7.jacobian(world.grasp))
+
+
+def test_one_flexion_joint_told_as_a_closing_gives_the_same_bits(seed: int) -> None:
+    world = World(seed)
+    w = {i: 0.06 * (-1) ** i * np.eye(world.hand.n)[j] for i, (j,) in enumerate(world.hand.gammas)}
+    for ask in (KinematicTask().error, KinematicTask().jacobian):
+        np.testing.assert_array_equal(ask(with_closings(world.grasp, w)), ask(world.grasp))
+
+
+def test_two_equally_fast_joints_have_a_direction_once_it_is_told_how_they_close() -> None:
+    J = 0.1 * np.eye(3)[:, :2]
+    grasp = one_finger(J, unit(np.array([1.0, 1.0, 0.0])), np.zeros((3, 2, 2)))
+    (error,) = KinematicTask().error(with_closings(grasp, {0: np.array([1.0, 1.0])}))
+    assert error == pytest.approx(0.0, abs=EXACT)
+
+
+def test_a_closing_that_closes_nothing_is_a_named_case() -> None:
+    J = 0.1 * np.eye(3)[:, :2]
+    grasp = one_finger(J, np.array([0.0, 0.0, 1.0]), np.zeros((3, 2, 2)))
+    with pytest.raises(InputError, match=r"contact 0 \('tip_1'\) has no flexion joint"):
+        KinematicTask().error(with_closings(grasp, {0: np.zeros(2)}))
+
+
 def test_two_equally_fast_directions_are_a_named_case() -> None:
     J = 0.1 * np.eye(3)[:, :2]
     grasp = one_finger(J, unit(np.ones(3)), np.zeros((3, 2, 2)))
