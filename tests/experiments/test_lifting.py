@@ -197,9 +197,7 @@ def test_a_driver_that_stops_while_it_lowers_keeps_the_hand_closed_there(scene, 
     assert done.reason == end and done.lifted and not done.set_down
     assert not any(call == "move" for call, _, _ in driver.told)
     # One that stopped before is told to press once more, and set down.
-    driver, done = lifted(
-        scene, grasp, lambda driver: {"reason": "stopped"}, lambda driver: grasp
-    )
+    driver, done = lifted(scene, grasp, lambda driver: {"reason": "stopped"}, lambda driver: grasp)
     assert done.reason == "stopped" and driver.told[-2][0] == "move"
 
 

@@ -135,7 +135,9 @@ def test_a_paired_difference_has_its_covariance_in_its_interval():
         difference, low, high = paired_difference(one, other)
         assert difference == pytest.approx((better - worse) / n)
         # The variance of a mean of n + 2 differences, each 1, 0 or −1.
-        pairs = np.repeat([1.0, -1.0, 0.0], [2 * better + 1, 2 * worse + 1, 2 * (both + neither + 1)])
+        pairs = np.repeat(
+            [1.0, -1.0, 0.0], [2 * better + 1, 2 * worse + 1, 2 * (both + neither + 1)]
+        )
         width = 1.96 * pairs.std() / np.sqrt(n + 2)
         assert (high + low) / 2 == pytest.approx(pairs.mean())
         assert (high - low) / 2 == pytest.approx(width)
