@@ -1,5 +1,7 @@
 """The package's command line: scenarios without their folder, reports."""
 
+import dataclasses
+import inspect
 import io
 import subprocess
 import sys
@@ -8,7 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import hqp_grasp as hg
-from hqp_grasp.__main__ import main
+from hqp_grasp.__main__ import judge, main, view
+from hqp_grasp.experiments.picking import PickSettings
+from hqp_grasp.experiments.scenario import Settings
 
 
 def call(monkeypatch, *arguments):
@@ -84,3 +88,31 @@ def test_every_command_speaks_to_any_terminal(monkeypatch, tmp_path, results, en
         assert "force ▷ moment ▷ kinematic" in said
     elif arguments[0] == "run" and len(arguments) > 3:
         assert "force > moment > kinematic" in said
+
+
+def defaults(command):
+    parameters = inspect.signature(command).parameters.values()
+    return {p.name: p.default for p in parameters if p.default is not p.empty}
+
+
+def test_commands_do_by_default_what_their_pages_say():
+    run = {f.name: f.default for f in dataclasses.fields(Settings)}
+    assert (run["stack"], run["trials"], run["probes"], run["seed"]) == ("fmk", 40, 40, 0)
+    assert (run["jobs"], run["cluster"], run["out"], run["strict"]) == (2, None, None, False)
+    assert (run["form"], run["solver"], run["landing"]) == ("hierarchy", "proxqp", True)
+    assert (run["kinematic_error"], run["links"], run["probe"]) == ("angle", "block", "geometric")
+    assert (run["joint_cap"], run["contact_cap"]) == (0.35, 0.03)
+    assert (run["replay"], run["view"], run["port"]) == (0, False, 8080)
+    pick = {f.name: f.default for f in dataclasses.fields(PickSettings)}
+    assert (pick["trials"], pick["mass"], pick["force"], pick["lift"]) == (20, 0.5, 5.0, 0.1)
+    assert (pick["friction"], pick["actual_friction"], pick["timestep"]) == (0.5, 0.6, 0.004)
+    assert (pick["probe"], pick["replay"], pick["view"]) == ("physical", 0, False)
+    assert (pick["seed"], pick["jobs"]) == (0, 2)
+    assert defaults(judge) == {
+        **{"squeeze": ("hierarchy",), "protocol": ("pulls",), "force": 5.0, "mass": 0.1},
+        **{"friction": 0.6, "believed": 0.5, "probe": None, "jobs": 2, "cluster": None},
+    }
+    assert defaults(view) == {
+        **{"compare": None, "trial": None},
+        **{"host": "127.0.0.1", "port": 8080},  # this machine only
+    }

@@ -126,13 +126,13 @@ class Judgements:
 
 
 def _found(scene: Scene, rows: Sequence[Mapping[str, object]], probe: int | None) -> Found | str:
+    touched = [i for i, row in enumerate(rows) if row["in_contact"]]
+    if not touched:
+        return "no grasp to judge: the object was never touched"
+    at = touched[-1] if probe is None else probe
+    if at not in touched:
+        return f"no touch at {at}"
     frames = frames_of_rows(rows, scene.articulated.joints)
-    if probe is None:
-        at = next((i for i in reversed(range(len(frames))) if frames[i].touched), None)
-    else:
-        at = probe if probe < len(frames) and frames[probe].touched else None
-    if at is None:
-        return "no grasp to judge: the hand was lost" if probe is None else f"no touch at {probe}"
     frame = frames[at]
     return Found(placed(scene, frames).base, at, frame.q, frame.positions, frame.normals)
 

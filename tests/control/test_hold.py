@@ -1,9 +1,12 @@
 """Holding: how hard to press, from what is felt, as a pure function."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import hqp_grasp as hg
+from hqp_grasp.control.forces import Squeeze
 from hqp_grasp.control.hold import RELAXING, RESERVE
 from hqp_grasp.errors import InputError
 from hqp_grasp.world.description import RobotDescription
@@ -110,6 +113,61 @@ def test_a_hand_that_has_not_followed_yet_is_not_blamed(robot, hold):
     for _ in range(2 * hold.patience):
         press = hold.step(carrying(robot, np.full(3, 5.0), normal=6.0), press)
     assert press.strength == hold.grip.most and not press.reason
+
+
+def test_where_no_wrench_is_felt_the_grip_is_what_was_asked_and_relaxes_to_it(robot, hold):
+    felt = carrying(robot, np.full(3, 3.0))
+    silent = replace(felt, contacts=tuple(replace(c, wrench=None) for c in felt.contacts))
+    press = hold.step(silent)
+    assert (press.strength, press.used, press.load) == (5.0, 0.0, 0.0)
+    strong = hold.step(felt)
+    assert hold.step(silent, strong).strength == pytest.approx(0.97 * strong.strength)
+
+
+def test_what_a_contact_uses_is_its_own_and_the_load_is_what_all_carry_upwards(robot, hold):
+    press = hold.step(carrying(robot, [1.0, -0.5, 2.0], normal=4.0))
+    assert press.used == pytest.approx(2.0 / 4.0) and press.load == pytest.approx(2.5)
+    one = hold.step(carrying(robot, [0.0, 0.0, 2.5]))
+    # Half of the friction believed in for all together; the worst contact all of it.
+    assert one.strength == pytest.approx(max(5.0, 2.5 / (3 * 0.5 * 0.5), 5.0 * 0.5 / 0.5))
+    sideways = carrying(robot, np.zeros(3))
+    pushed = [replace(sideways.contacts[0], wrench=[9.0, 0, 0, 0, 0, 0]), *sideways.contacts[1:]]
+    n = sideways.normals[0]
+    press = hold.step(replace(sideways, contacts=tuple(pushed)))
+    assert press.used == pytest.approx(np.sqrt(1.0 - n[0] ** 2) / n[0])
+
+
+class Fails(hg.Grip):
+    """Finds no forces."""
+
+    def solve(self, grasp, wrench=None, warm=None):
+        return Squeeze(None, None, None, reason="no forces found: singular")
+
+
+def test_where_no_forces_are_found_the_last_torques_are_kept_and_what_is_felt_is_told(robot, hold):
+    begun = hold.step(carrying(robot, np.full(3, 2.0)))
+    failing = hg.Hold(Fails(robot, 5.0, MU))
+    press = begun
+    for n in range(1, 4):
+        press = failing.step(carrying(robot, np.full(3, 1.0)), press)
+        assert np.array_equal(press.torque, begun.torque) and press.strength == begun.strength
+        assert press.blind == n and press.load == pytest.approx(3.0)
+        assert press.used == pytest.approx(0.2)
+    assert press.reason == "no forces found: singular"
+    with pytest.raises(InputError, match="Hold: no forces found: singular"):
+        failing.step(carrying(robot, np.zeros(3)))
+
+
+def test_a_hand_has_followed_once_nine_tenths_of_what_was_asked_are_felt(robot, hold):
+    most, strained = hold.grip.most, np.full(3, 9.0)
+    for share, counts in ((0.89, 0), (0.91, 1)):
+        press = hold.step(carrying(robot, strained, normal=most))
+        assert press.strength == most and press.straining == 0
+        press = hold.step(carrying(robot, share * strained, normal=share * most), press)
+        assert press.straining == counts
+    press = hold.step(carrying(robot, np.zeros(3), normal=most), press)
+    assert press.straining == 0  # in a row
+    assert hg.Hold(hold.grip).patience == 3
 
 
 @pytest.mark.parametrize("felt", [BLIND, hg.Missed(hg.Miss.NO_TOUCH, "finger_2")])

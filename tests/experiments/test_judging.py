@@ -10,8 +10,18 @@ import pytest
 import hqp_grasp as hg
 from hqp_grasp.__main__ import app
 from hqp_grasp.errors import InputError, ResultsError
-from hqp_grasp.experiments.judging import COLUMNS, Judging, judge_folder, summary
+from hqp_grasp.experiments.judging import (
+    COLUMNS,
+    Judging,
+    _about,
+    _found,
+    _measured,
+    judge_folder,
+    summary,
+)
+from hqp_grasp.experiments.replay import rows_of
 from hqp_grasp.experiments.study import Study
+from hqp_grasp.experiments.table import table_of
 from hqp_grasp.judge.judge import AXES, Judge
 
 STACK = hg.ForceTask() >> hg.MomentTask() >> hg.KinematicTask()
@@ -76,7 +86,7 @@ def test_the_first_touch_is_judged_beside_the_last(folder, scene, judged):
 
 def test_a_trial_without_a_grasp_is_not_held_and_says_why(folder, judges):
     judging, _ = Judging.of(folder, judges)
-    lost = dataclasses.replace(judging, found=("no grasp to judge: the hand was lost",))
+    lost = dataclasses.replace(judging, found=("no grasp to judge: the object was never touched",))
     for row in lost.attempt((SEED, 0)).to_table().to_pylist():
         assert row["lifted"] is False and row["passed"] is False and row["error"] is None
         assert row["reason"].startswith("no grasp to judge")
@@ -126,6 +136,64 @@ def test_the_summary_has_a_line_for_every_judge(judged):
     lines = summary(judged).splitlines()
     assert lines[2].startswith("hierarchy, pulls") and f"{TRIALS} of {TRIALS} [" in lines[2]
     assert lines[3].startswith("equal-torque, pulls")
+
+
+def test_the_summary_counts_and_tells_medians_and_the_worst():
+    kinds = (("hierarchy", "pulls"), ("equal-torque", "pulls"))
+    rows = [dict.fromkeys(COLUMNS) | {"squeeze": a, "protocol": b} for a, b in kinds for _ in "abc"]
+    found = zip((1.0, 4.0, 9.0, 2.0, None, None), (0.1, 0.3, 0.2, None, None, None), strict=True)
+    for i, (axis, twist) in enumerate(found):
+        rows[i] |= {"weakest_axis": axis, "weakest_twist": twist, "sum_normal": 10.0 + i}
+        rows[i] |= {"passed": axis is not None, "reason": None if axis else "dropped"}
+    rows[4] |= {"reason": "out of reach"}
+    rows[5] |= {"reason": None, "error": "E: why", "sum_normal": None}
+    lines = summary(table_of(rows, COLUMNS)).splitlines()
+    assert [" ".join(line.split()) for line in lines[2:]] == [
+        "hierarchy, pulls 3 of 3 [43.8%, 100.0%] 11.0 4.0 (1.0) 0.20",
+        "equal-torque, pulls 1 of 3 [6.1%, 79.2%] 13.5 2.0 (2.0) –",
+        "1 × out of reach",
+        "1 judgements ended in an error, the first: E: why",
+    ]
+    few = [row | {"weakest_axis": None, "sum_normal": None} for row in rows[:1]]
+    assert summary(table_of(few, COLUMNS)).splitlines()[2].split()[-3:] == ["–", "–", "0.10"]
+    many = [row | {"reason": why} for row, why in zip(rows, "bcbcca", strict=True)]
+    why = summary(table_of(many, COLUMNS)).splitlines()[4:7]
+    assert why == ["    3 × c", "    2 × b", "    1 × a"]
+
+
+def without_touch(row):
+    return row | {"in_contact": False} | dict.fromkeys(n for n in row if n.startswith("contact_"))
+
+
+def test_the_grasp_judged_is_the_last_that_was_felt_or_that_of_the_probe(folder, judges, scene):
+    rows = rows_of(pq.read_table(folder / "probes.parquet"), 0)
+    last = Judging.of(folder, judges)[0].found[0]
+    assert last.probe == PROBES
+    normal = [rows[PROBES][f"contact_2_n{axis}"] for axis in "xyz"]
+    np.testing.assert_array_equal(last.normals[1], normal)
+    lost = [*rows[:-1], without_touch(rows[-1])]
+    assert _found(scene, lost, None).probe == PROBES - 1
+    assert _found(scene, lost, PROBES) == f"no touch at {PROBES}"
+    assert _found(scene, rows, PROBES + 1) == f"no touch at {PROBES + 1}"
+    assert _found(scene, rows, 2).probe == 2
+    nowhere = [without_touch(row) for row in rows]
+    for probe in (None, 0):  # as where no start was found: it costs no other trial
+        never = "no grasp to judge: the object was never touched"
+        assert _found(scene, nowhere, probe) == never
+
+
+def test_beside_the_verdict_stand_measures_by_the_judges_force_and_frictions(folder, scene):
+    judge = Judge(scene, "equal-torque", force=4.0, friction=0.7, believed=0.3)
+    judging, _ = Judging.of(folder, [judge])
+    _, grasp = judging.found[0].placed(scene)
+    told = _measured(grasp, judge)
+    squeeze = hg.Grip(scene.articulated, 4.0, 0.3).solve(grasp)
+    assert told["margin"] == squeeze.margin.min()
+    assert told["ferrari_canny"] == hg.mechanics.ferrari_canny(grasp.positions, grasp.normals, 0.7)
+    about = _about(judge)
+    assert (about["force"], about["mass"], about["friction"]) == (4.0, 0.1, 0.7)
+    assert (about["squeeze"], about["protocol"]) == ("equal-torque", "pulls")
+    assert _about(dataclasses.replace(judge, squeeze=_measured))["squeeze"] == "_measured"
 
 
 def test_the_command_judges_a_folder(folder, judged, capsys):

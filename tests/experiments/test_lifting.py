@@ -172,7 +172,7 @@ def test_what_is_not_safe_is_set_down_at_once_with_the_reason(scene, grasp, heig
 
     driver, done = lifted(scene, grasp, said)
     assert done.moments[-1].phase == "lower" and done.set_down
-    assert [m.phase for m in done.moments if m.press.reason][0] == phase
+    assert next(m.phase for m in done.moments if m.press.reason) == phase
     assert not done.lifted and np.isnan(done.weight) and done.reason == "it slips"
     assert (8.0, 2.0) in driver.carries() and (110.0, 0.3) not in driver.carries()
 

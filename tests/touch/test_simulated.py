@@ -863,7 +863,7 @@ def test_the_finger_that_touches_or_stalls_first_is_the_one_that_is_told(scene, 
         hand.place(CLOSED)
         for i in range(2):
             hand.close(i, 0.5, 0.8)
-        state, sensors = hand._run(hand._plan(25))
+        state, _ = hand._run(hand._plan(25))
         wrench = np.random.default_rng(0).normal(scale=1e-4, size=(25, 2, 6))
         return hand, state, wrench
 
