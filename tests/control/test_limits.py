@@ -332,6 +332,13 @@ def test_a_mink_limit_that_keeps_no_model_is_asked_for_one(scene, robot):
     np.testing.assert_array_equal(level.upper, 0.5)
 
 
+def test_a_model_that_is_given_is_taken_before_the_limits_own(scene, robot):
+    own, given = mink.ConfigurationLimit(scene.model), Scene().model
+    assert MinkLimit(own, given).model is given and MinkLimit(own).model is scene.model
+    assert MinkLimit(mink.VelocityLimit(scene.model)).model is None  # and it needs none
+    assert MinkLimit(own).dt == 1.0
+
+
 def test_a_hierarchy_keeps_minks_limits(scene, robot):
     """Towards a posture far beyond a mink cap: the step is the cap, and certified."""
     limit = mink.VelocityLimit(scene.model, {"wam_j1": 0.1})

@@ -551,3 +551,89 @@ def test_stacks_without_a_law_that_has_a_goal_are_the_plain_hierarchy(cylinder, 
         for form in ("hierarchy", "memoryless")
     ]
     assert steps[0].tobytes() == steps[1].tobytes()
+
+
+# ---------------------------------------------------------------- what the planner is made of
+
+
+def test_about_a_fixed_point_moments_change_along_the_way_by_their_closed_secant(first):
+    """The reference stays where it is while the contacts move."""
+    target = targets_of(first)[0][0]
+    reference = np.array([0.6, 0.1, 0.3])
+    c, n = target.way.at(0.4)
+    motion, x = c - first.centers, first.positions
+    change = np.cross(n, c - TIP * n - reference).sum(axis=0)
+    change -= np.cross(first.normals, x - reference).sum(axis=0)
+    A, b = target._secant(MomentTask(reference=reference), motion, 0.4, 1.0)
+    step = np.linalg.lstsq(first.jacobian, motion.ravel(), rcond=None)[0]
+    np.testing.assert_allclose(A @ step, change, atol=1e-9)
+    left = np.cross(target.way.at(1.0)[1], target.imagined(1.0).positions - reference).sum(axis=0)
+    goal = MomentTask.goal
+    due = change if left @ left <= goal else change - 0.4 * left
+    np.testing.assert_allclose(b, due, atol=1e-9)
+
+
+@pytest.mark.parametrize("laws", [ForceTask(), MomentTask(), MomentTask(reference=[0.7, 0.0, 0.2])])
+def test_each_contact_adds_by_its_own_motion_and_a_share_of_what_all_add_together(first, laws):
+    target = targets_of(first)[0][0]
+    motion = target.way.at(0.4)[0] - first.centers
+    e = laws.error(first)
+    alone = np.array([laws.error(target.imagined(0.4, i)) - e for i in range(3)])
+    together = laws.error(target.imagined(0.4)) - e - alone.sum(axis=0)
+    A, _ = target._secant(laws, motion, 0.4, 1.0)
+    for i in range(3):
+        one = np.zeros((3, 3))
+        one[i] = motion[i]
+        step = np.linalg.lstsq(first.jacobian, one.ravel(), rcond=None)[0]
+        np.testing.assert_allclose(A @ step, alone[i] + together / 3.0, atol=1e-9)
+
+
+def test_what_a_grasp_would_be_on_the_way_is_felt_where_the_surface_says(first):
+    target = targets_of(first)[0][0]
+    c, n = target.way.at(0.3)
+    whole, one = target.imagined(0.3), target.imagined(0.3, 1)
+    np.testing.assert_allclose(whole.positions, c - TIP * n)
+    np.testing.assert_array_equal(whole.normals, n)
+    np.testing.assert_array_equal(one.normals[[0, 2]], first.normals[[0, 2]])
+    np.testing.assert_array_equal(one.normals[1], n[1])
+    np.testing.assert_array_equal(whole.q, first.q)
+    np.testing.assert_allclose(target.imagined(0.0).positions, first.positions, atol=1e-6)
+
+
+def test_a_hand_that_found_nothing_is_sent_around_opposite_sides_first():
+    policy, nothing = MissPolicy(), Missed(Miss.NO_TOUCH, "x")
+    ways = [policy.direction([nothing] * n) for n in range(1, 9)]
+    t = np.radians([0.0, 180.0, 90.0, 270.0, 45.0, 225.0, 135.0, 315.0])
+    level = 0.02 * np.column_stack([np.cos(t), np.sin(t), np.zeros(8)])  # [m]
+    np.testing.assert_allclose(ways, level, atol=1e-12)
+    assert policy.direction([nothing] * 9) is None
+    # A passing trouble among them is tried again there, and costs no side.
+    stuck = Missed(Miss.BLOCKED, "x")
+    np.testing.assert_array_equal(policy.direction([nothing, stuck]), np.zeros(3))
+    np.testing.assert_allclose(policy.direction([nothing, stuck, nothing]), ways[1], atol=1e-12)
+    assert policy.direction([stuck] * 4) is None
+
+
+def test_by_default_a_hand_tries_three_shares_six_centimetres_back_and_four_times_again():
+    policy = MissPolicy()
+    assert policy.shares == (1.0, 0.5, 0.25) and not policy.restart
+    assert (policy.retreat, policy.retreats, policy.repeats) == (0.01, 6, 4)
+
+
+def test_of_targets_the_first_that_nothing_keeps_the_hand_from_is_taken():
+    class Asked:
+        def __init__(self, obstacle):
+            self.is_in_the_way, self.asked = obstacle, 0
+
+        def obstacle(self, robot, gain):
+            self.asked += 1
+            return self.is_in_the_way
+
+    for obstacles, taken, asked in (
+        ((0.5, 0.0, 0.0), 1, [1, 1, 0]),
+        ((0.5, 0.2, np.inf), 1, [1, 1, 1]),
+        ((0.3, 0.3), 0, [1, 1]),
+    ):
+        targets = [Asked(obstacle) for obstacle in obstacles]
+        assert nearest_free(targets, None, 1.0) is targets[taken]
+        assert [target.asked for target in targets] == asked

@@ -314,7 +314,7 @@ def test_convexity_bounds_normals_felt_with_noise():
 # ---------------------------------------------------------------- any number of contacts
 
 
-@pytest.mark.parametrize("k", [4, 5, 6, 8])
+@pytest.mark.parametrize("k", [4, 5, 6, 7, 8])
 def test_angles_near_those_given_sum_to_zero_in_their_order(k):
     rng = np.random.default_rng(k)
     theta = 2.0 * np.pi * np.arange(k) / k + 0.2 * rng.standard_normal(k)

@@ -734,3 +734,13 @@ def test_a_kinematic_task_is_replaced_field_by_field_as_any_dataclass_is():
     assert dataclasses.replace(task, gain=0.75) == KinematicTask("eq7", "gradient", gain=0.75)
     assert dataclasses.replace(task, error="angle").kind == "angle"
     assert dataclasses.replace(task, kind="angle") == KinematicTask(form="gradient", gain=0.5)
+
+
+def test_laws_are_by_default_the_papers_for_an_object_of_five_centimetres() -> None:
+    force, moment = ForceTask(), MomentTask()
+    angle, rows = KinematicTask(), KinematicTask(form="rows")
+    assert force.radius == 0.05 and moment.reference == "centroid"  # [m]
+    assert (force.goal, moment.goal) == (1e-3, pytest.approx(4e-6))  # [N²], [(N·m)²]
+    assert (angle.kind, angle.form, angle.gain, rows.gain) == ("angle", "gradient", 0.6, 0.25)
+    assert (force.gain, moment.gain) == (1.0, 1.0)
+    assert {law.weight for law in (force, moment, angle, rows)} == {1.0}

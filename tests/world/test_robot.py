@@ -660,3 +660,43 @@ def test_a_grasp_is_complete_with_what_the_robot_knows(robot):
             np.testing.assert_allclose(contact.point, site.pos, atol=EXACT)
     with pytest.raises(InputError, match=r"touches with 3 points .*; got 2 contacts"):
         robot.grasp(q, contacts[:2])
+
+
+JAWS = """
+<mujoco>
+  <compiler autolimits="true"/>
+  <worldbody>
+    <body name="palm">
+      <inertial mass="1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>
+      <joint name="lift" type="slide" axis="0 0 1" range="-0.5 0.5"/>
+      <site name="palm"/>
+      {jaws}
+    </body>
+  </worldbody>
+</mujoco>"""
+JAW = """
+<body name="{name}">
+  <inertial mass="1" pos="0 0 0" diaginertia="1e-3 1e-3 1e-3"/>
+  <joint name="{name}" type="slide" axis="{axis} 0 0" range="{low} {high}"/>
+  <geom name="{name}" type="sphere" size="0.005" pos="0 0 0.1" mass="0"/>
+  <site name="{name}" pos="0 0 0.1"/>
+</body>"""
+
+
+@pytest.mark.parametrize(("axis", "opens"), [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+def test_jaws_that_are_closed_at_home_close_against_the_way_they_can_go(tmp_path, axis, opens):
+    """The other way they open, whatever the sign of the joint and the side of its range."""
+    ranges = {"one": sorted((0.0, 0.04 * opens)), "other": sorted((0.0, -0.04 * opens))}
+    jaws = "".join(
+        JAW.format(name=name, axis=axis, low=low, high=high) for name, (low, high) in ranges.items()
+    )
+    points = "".join(
+        f'[[contact_points]]\nname = "{name}"\nsite = "{name}"\ngeom = "{name}"\n'
+        for name in ranges
+    )
+    (tmp_path / "tiny.xml").write_text(JAWS.format(jaws=jaws))
+    about = 'model = "tiny.xml"\npalm = "palm"\narm = ["lift"]\n'
+    about += "[velocity]\nlift = 0.1\none = 0.1\nother = 0.1\n"
+    (tmp_path / "robot.toml").write_text(about + points)
+    robot = Scene(tmp_path).articulated
+    np.testing.assert_array_equal(np.sign(robot.closing), [[0, -opens, 0], [0, 0, opens]])
