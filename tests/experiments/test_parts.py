@@ -1,5 +1,6 @@
 """Finished trials on disk: never half a file, never 100,000 files, in order in the end."""
 
+import itertools
 import signal
 import subprocess
 import sys
@@ -371,3 +372,100 @@ def test_killed_at_any_moment_every_file_is_whole(tmp_path):
         assert parts.broken == [] and done == list(range(len(done)))
         if done:
             assert merged(parts, tmp_path).equals(expected(done))
+
+
+# ---------------------------------------------------------------- how files are written
+
+
+def seal_of(path):
+    """The seal of a file; what is said where it does not hold."""
+    try:
+        return module.sealed(path)
+    except ResultsError as error:
+        return str(error)
+
+
+def test_whatever_byte_of_a_file_is_changed_its_seal_does_not_hold(tmp_path):
+    added(tmp_path, [0])
+    path = tmp_path / "trial_000000.parquet"
+    whole = path.read_bytes()
+    assert seal_of(path) == OF
+    flipped = [
+        whole[:at] + bytes([whole[at] ^ flip]) + whole[at + 1 :]
+        for at, flip in zip(range(0, len(whole), 7), itertools.cycle((0x01, 0x80)), strict=False)
+    ]
+    for change in (*flipped, whole[1:], whole[:-1], whole + b"\0", b"", whole[:8]):
+        path.write_bytes(change)
+        assert seal_of(path) in (None, "its checksum does not fit: damaged since it was written")
+
+
+def test_a_large_file_is_sealed_as_a_small_one_is(tmp_path):
+    """Digests read a mebibyte at a time."""
+    noise = np.random.default_rng(0).random(300_000)
+    rows = pa.table({"trial": np.zeros(300_000, int), "value": noise})
+    module._write([rows], tmp_path / "large.parquet", OF)
+    path = tmp_path / "large.parquet"
+    assert path.stat().st_size > 2 * (1 << 20) and module.sealed(path) == OF
+    content = bytearray(path.read_bytes())
+    for at in (100, 1 << 20, (1 << 20) + 1, 2 * (1 << 20) + 5, len(content) - 20):
+        content[at] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(ResultsError, match="checksum does not fit"):
+            module.sealed(path)
+        content[at] ^= 1
+
+
+def test_what_stays_is_packed_small_and_what_goes_soon_is_packed_fast(tmp_path):
+    parts = added(tmp_path, range(5))
+    merged(parts, tmp_path)
+    packing = {}
+    for path in tmp_path.iterdir():
+        column = pq.ParquetFile(path).metadata.row_group(0).column(0)
+        packing[path.name] = column.compression
+    assert packing == {
+        "batch_000000.parquet": "ZSTD",
+        "trial_000004.parquet": "SNAPPY",
+        "whole.parquet": "ZSTD",
+    }
+    assert module._unlike(table(0).schema, table(0).schema) == ""
+
+
+def test_at_most_three_columns_that_are_missing_are_named():
+    whole = table(0)
+    few = whole.select(["trial"])
+    assert module._unlike(few.schema, whole.schema) == "it has no 'seed', 'probe', 'value'"
+    assert module._unlike(whole.schema, few.schema) == "it has 'seed', 'probe', 'value'"
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "holds"),
+    [
+        ("whole numbers", pa.array([1, 2], pa.int32()), True),
+        ("whole numbers", pa.array([1.0, 2.0]), False),
+        ("numbers", pa.array([1, 2]), True),
+        ("numbers", pa.array([1.0, None]), True),
+        ("numbers", pa.nulls(2), True),
+        ("numbers", pa.array(["1", "2"]), False),
+        ("true or false", pa.array([True, False]), True),
+        ("true or false", pa.array([1, 0]), False),
+        ("texts", pa.array(["a", None]), True),
+        ("texts", pa.array(["a", "b"], pa.large_string()), True),
+        ("texts", pa.nulls(2), True),
+        ("texts", pa.array([1, 2]), False),
+    ],
+)
+def test_a_column_holds_what_a_reader_asks_of_it(tmp_path, kind, values, holds):
+    pq.write_table(pa.table({"x": values}), tmp_path / "whole.parquet")
+    read = partial(module.read_results, tmp_path / "whole.parquet", {"x": kind})
+    if holds:
+        assert read()["x"].to_pylist() == values.to_pylist()
+    else:
+        with pytest.raises(ResultsError, match=f"column 'x' holds .*, not {kind}"):
+            read()
+
+
+def test_a_reader_is_told_of_gaps_only_where_there_may_be_none(tmp_path):
+    for kind, values in (("whole numbers", [1, None]), ("true or false", [True, None])):
+        pq.write_table(pa.table({"x": pa.array(values)}), tmp_path / "whole.parquet")
+        with pytest.raises(ResultsError, match="column 'x' has gaps"):
+            module.read_results(tmp_path / "whole.parquet", {"x": kind})
