@@ -57,6 +57,8 @@ SWAPPED = {
 }
 CALLS = {"min": "max", "minimum": "maximum", "argmin": "argmax", "sin": "cos", "any": "all"}
 CALLS |= {new: old for old, new in CALLS.items()} | {"floor": "ceil", "ceil": "floor"}
+# To exchange the first two arguments of these changes nothing.
+COMMUTE = {"min", "max", "minimum", "maximum", "fmin", "fmax", "hypot", "not_equal", "equal"}
 # What only shows: how a figure looks, what a message says; `strict` guards lengths that agree.
 LOOKS = {
     "repr",
@@ -145,7 +147,7 @@ def mutants_of(source: str, module: str) -> list[Mutant]:
                 end = span(node.func)[1]
                 yield "call", end - len(name), end, CALLS[name]
             starred = any(isinstance(each, ast.Starred) for each in node.args[:2])
-            if len(node.args) > 1 and name != "isinstance" and not starred:
+            if len(node.args) > 1 and name not in {"isinstance", *COMMUTE} and not starred:
                 (begin, left), (right, end) = span(node.args[0]), span(node.args[1])
                 turned = data[right:end] + data[left:right] + data[begin:left]
                 yield "order", begin, end, turned.decode()
