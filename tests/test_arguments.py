@@ -252,3 +252,49 @@ def test_a_scene_of_numpys_numbers_is_saved_and_read(tmp_path):
         scene.save(tmp_path / "scene.json")
         assert hg.Scene.load(tmp_path / "scene.json") == scene
         assert json.loads((tmp_path / "scene.json").read_text())["object"]["height"] == 0.125
+
+
+# What is taken where nothing is given; what else has no default, or one that says nothing.
+DEFAULTS = {
+    hg.Body: {"scale": 1.0},
+    hg.Contact: {"name": "", "point": None, "flexion": (), "tip_radius": 0.0, "noise": 0.0},
+    hg.Controller: {"form": "hierarchy", "budget": None, "landing": True},
+    hg.Cylinder: {"height": 0.12},
+    hg.DriverLimits: {"grip": 0.0},
+    hg.ForceTask: {"gain": 1.0, "weight": 1.0, "radius": 0.05},
+    hg.GeometricProbe: {"links": "block"},
+    hg.Grip: {"force": 5.0, "friction": 0.5, "most": 15.0, "hqp": hg.HQP("daqp")},
+    hg.HQP: {"solver": "proxqp", "rank_tolerance": None, "budget": 60_000_000},
+    hg.HierarchyForm: {"size": 0.05},
+    hg.Hold: {"patience": 3},
+    hg.MinkLimit: {"model": None, "dt": 1.0},
+    hg.MomentTask: {"gain": 1.0, "weight": 1.0, "reference": "centroid"},
+    hg.Noise: {"normal": 0.0, "position": 0.0},
+    hg.PhysicalProbe: {"force": 1.0, "table": None},
+    hg.Physics: {"contact": "medium", "support": "fixed", "mass": 0.1, "friction": 0.6}
+    | {"timestep": 0.002},
+    hg.Pick: {"force": 5.0, "friction": 0.5, "height": 0.1},
+    hg.PostureTask: {"gain": 1.0, "weight": 1.0, "target": None},
+    hg.Prism: {"height": 0.12},
+    hg.Projection: {"damping": 0.0, "rank_tolerance": None},
+    hg.Scene: {"robot": "wam_bhand", "position": None, "base": (0, 0, 0, 1, 0, 0, 0)},
+    hg.SimulatedHand: {"links": "block", "force_limit": 15.0, "watchdog": 1.0, "grip_limit": 20.0},
+    hg.Solution: {"failed": (), "certified": False, "rank_tolerance": None},
+    hg.Stack: {"limits": (), "hold_contacts": True},
+    hg.StepLimit: {"joint": 0.35, "contact": 0.03},
+    hg.Study: {"trials": 40, "seed": 0, "jobs": 1, "strict": False, "cluster": None},
+    hg.Trial: {"probes": 60, "form": "hierarchy", "landing": True, "links": "block"}
+    | {"probe": "geometric", "preset": None, "noise": None},
+    hg.solve_ik: {"solver": "active-set", "damping": 0.0, "safety_break": False},
+}
+
+
+@pytest.mark.parametrize("what", DEFAULTS, ids=lambda what: what.__name__)
+def test_what_is_not_given_is_what_pages_and_signatures_say(what):
+    given = {p.name: p.default for p in inspect.signature(what).parameters.values()}
+    assert {name: given[name] for name in DEFAULTS[what]} == DEFAULTS[what]
+
+
+def test_a_world_is_perfect_unless_told_otherwise():
+    values = {f.name: f.default for f in dataclasses.fields(hg.Imperfections)}
+    assert values.pop("faults") == () and set(values.values()) == {0.0}
