@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hqp_grasp.control.episode import Episode
+from hqp_grasp.control.episode import Episode, MissPolicy
 from hqp_grasp.control.forms import (
     FORMS,
     HierarchyForm,
@@ -15,12 +15,15 @@ from hqp_grasp.control.forms import (
     clip_to_limits,
     form_of,
 )
-from hqp_grasp.control.limits import StepLimit
-from hqp_grasp.grasp import Contact, Grasp, Touch
+from hqp_grasp.control.limits import ConfigurationLimit, RetreatLimit, StepLimit
+from hqp_grasp.control.targets import Target
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
+from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.surface.believed import believed
 from hqp_grasp.surface.felt import Felt
-from hqp_grasp.tasks import ForceTask, stack_of
+from hqp_grasp.tasks import ForceTask, Stack, stack_of
+from hqp_grasp.world.scene import Scene
 
 SEEDS = range(5)
 EXACT = 1e-12
@@ -184,3 +187,102 @@ def test_the_default_form_says_where_it_is_the_memoryless_one(laws, k):
     plan, plain = (form_of(name).plan(stack, alone(grasp)) for name in ("hierarchy", "memoryless"))
     assert plan.planner == plain.planner == "memoryless"
     np.testing.assert_array_equal(plan.x, plain.x)
+
+
+def pushing(degrees, n=11):
+    """A hand whose flexions push at that angle to the normals, to the side."""
+    grasp = hand(0, AROUND, n)
+    J = np.array(grasp.jacobian).reshape(3, 3, n)
+    for i, normal in enumerate(grasp.normals):
+        aside = np.cross(normal, [0.0, 0.0, 1.0])
+        aside /= np.linalg.norm(aside)
+        t = np.radians(degrees)
+        J[i, :, n - 3 + i] = 0.1 * (-np.cos(t) * normal + np.sin(t) * aside)
+    return dataclasses.replace(grasp, jacobian=J.reshape(9, n))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "before", "misses", "planner"),
+    [
+        (50, 9, 0, "paper-hierarchy"),
+        (40, 9, 0, "surface felt"),
+        (50, 10, 0, "surface felt"),  # that is the eleventh touch
+        (50, 3, 1, "surface felt"),
+    ],
+)
+def test_in_the_first_ten_touches_fingers_that_push_aside_are_turned_first(
+    degrees, before, misses, planner
+):
+    aside = pushing(degrees)
+    off = [dataclasses.replace(aside, q=aside.q + 0.01 * i) for i in range(before)]
+    missed = [Touch(aside.q, Missed(Miss.NO_TOUCH, "finger_1"))] * misses
+    history = [*(Touch(g.q, g) for g in off), Touch(aside.q, aside), *missed]
+    stack = stack_of("fmk").within(WIDE)
+    assert HierarchyForm().plan(stack, Episode.of(history)).planner == planner
+    # By the kinematic law's angle alone: without it nobody asks.
+    for other in (stack_of("fm"), stack_of("fmk", "eq7")):
+        assert HierarchyForm().plan(other.within(WIDE), alone(aside)).planner == "surface felt"
+
+
+def test_the_default_form_tries_eight_shares_and_begins_again_and_others_do_not():
+    assert HierarchyForm().misses.shares == (1.0, 0.5, 0.25, 0.1, 1.0, 0.5, 0.25, 0.1)
+    assert HierarchyForm().misses.restart
+    for name in FORMS[1:]:
+        assert form_of(name).misses == MissPolicy()
+
+
+def test_a_form_has_the_solver_that_is_named_and_the_papers_damping():
+    for name in FORMS[:3]:
+        assert form_of(name, "daqp").hqp == HQP("daqp", rank_tolerance=1e-6)
+        assert form_of(name).hqp.solver == "proxqp"
+    assert form_of("clipped").projection == Projection(rank_tolerance=1e-6)
+    assert form_of("paper").projection == Projection(damping=1e-5)
+
+
+def test_the_way_is_led_by_the_smallest_gain_of_its_laws_and_never_beyond_it():
+    """Half of the force's error is asked for, by a law that asks for half."""
+    grasp = hand(0, AROUND)
+    error = ForceTask().error(grasp)
+    left = {}
+    for gain in (0.5, 1.0, 2.0):
+        stack = Stack.of(ForceTask(gain=gain)).within(WIDE)
+        plan = HierarchyForm().plan(stack, alone(grasp))
+        assert plan.planner == "surface felt"
+        left[gain] = error + ForceTask().jacobian(grasp) @ plan.x
+    surface = walls(grasp)
+    for gain in (0.5, 1.0):
+        way = Target.each(surface, stack_of("f"), grasp)[0].way.at(gain)
+        np.testing.assert_allclose(
+            HierarchyForm().plan(Stack.of(ForceTask(gain=gain)).within(WIDE), alone(grasp)).x
+            @ np.array(grasp.jacobian).T,
+            (way[0] - grasp.centers).ravel(),
+            atol=1e-6,
+        )
+    np.testing.assert_allclose(left[2.0], left[1.0], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_the_time_of_a_step_is_told_in_microseconds(name, monkeypatch):
+    ticks = iter(np.arange(0.0, 100.0, 0.25))
+    monkeypatch.setattr("time.perf_counter", lambda: next(ticks))
+    plan = form_of(name).plan(stack_of("fm").within(WIDE), alone(hand(0, AROUND)))
+    assert plan.solve_us == (7.5e5 if name == "hierarchy" else 2.5e5)
+
+
+def test_a_clipped_step_keeps_clear_by_the_least_way_and_then_to_the_ranges():
+    robot = Scene().articulated
+    grasp = robot.grasp(robot.home, [Contact(x, n) for x, n in zip(AROUND, np.eye(3), strict=True)])
+    away = RetreatLimit(robot, 0.01)
+    stack = stack_of("f").within(StepLimit(0.35, 1.0), ConfigurationLimit(robot), away)
+    x = clip_to_limits(np.zeros(robot.n), stack, grasp)
+    level = away.level(grasp)
+    np.testing.assert_allclose(level.A @ x, -0.01, atol=1e-9)
+    np.testing.assert_allclose(x, np.linalg.pinv(level.A) @ [-0.01], atol=1e-9)
+    far = clip_to_limits(
+        np.full(robot.n, 9.0), stack_of("f").within(ConfigurationLimit(robot)), grasp
+    )
+    np.testing.assert_allclose(grasp.q + far, robot.q_upper)
+    low = clip_to_limits(
+        np.full(robot.n, -9.0), stack_of("f").within(ConfigurationLimit(robot)), grasp
+    )
+    np.testing.assert_allclose(grasp.q + low, robot.q_lower)

@@ -348,3 +348,35 @@ def test_nothing_asked_is_answered_by_standing_still(world):
     for given in ({}, {"limits": world.limits}, {"limits": []}):
         assert np.abs(solve_ik(configuration, [[]], DT, **given)).max() < EXACT
     assert np.abs(solve_ik(configuration, [], DT)).max() < EXACT
+
+
+def test_opposite_rows_of_a_limit_become_one_that_may_ask_for_one_value(world: Any) -> None:
+    class Told(mink.Limit):
+        def __init__(self, G: Any, h: Any) -> None:
+            self.rows = np.array(G, dtype=float), np.array(h, dtype=float)
+
+        def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
+            return mink.Constraint(*self.rows)
+
+    configuration = world.configuration(world.inside())
+    one, two = np.eye(configuration.nv)[:2]
+
+    def level(G: Any, h: Any) -> Any:
+        (found,) = ik_levels(configuration, [], DT, limits=[Told(G, h)])
+        return found
+
+    held = level([one, two, -one, -two], [0.3, 0.2, -0.3, 0.1])
+    np.testing.assert_array_equal(held.A, [one, two])
+    np.testing.assert_array_equal(held.lower, [0.3, -0.1])
+    np.testing.assert_array_equal(held.upper, [0.3, 0.2])
+    for G, h in (
+        ([one, -one], [0.1, -0.2]),  # they contradict one another: each as it is
+        ([one, two], [0.1, 0.2]),
+        ([one, -one, two], [0.1, 0.2, 0.3]),
+    ):
+        apart = level(G, h)
+        np.testing.assert_array_equal(apart.A, G)
+        assert (apart.lower == -np.inf).all()
+        np.testing.assert_array_equal(apart.upper, h)
+    open_ = level([one, two, -one, -two], [0.3, np.inf, 0.1, 0.2])
+    np.testing.assert_array_equal(open_.upper, [0.3, 0.1, 0.2])

@@ -254,3 +254,181 @@ def test_what_was_made_in_a_script_travels_with_the_work(sent):
     payload, expected = sent
     there = expected | {"source": expected["source"] | {"__main__": "sha256:mine"}}
     assert executor._do(payload, json.dumps(there), 3) == 9
+
+
+# ---------------------------------------------------------------- a scheduler worked out by hand
+
+
+class Killed(Exception):  # noqa: N818 - as Dask names it
+    """What a scheduler says of a task that cost several workers."""
+
+
+class Future:
+    """A task that ends at once: with a result, an error, or lost so many times before."""
+
+    def __init__(self, key, ends, lost=0):
+        self.key, self.ends, self.lost = key, ends, lost
+        self.status = "error" if isinstance(ends, Exception) else "finished"
+
+    def add_done_callback(self, call):
+        call(self)
+
+    def exception(self, timeout):
+        if self.lost:
+            self.lost -= 1
+            raise OSError("the worker is gone")
+        return self.ends if self.status == "error" else None
+
+    def result(self, timeout):
+        return self.ends
+
+
+class Client:
+    """A scheduler whose workers have so many threads; `ends` says how a number ends."""
+
+    status = "running"
+    scheduler = type("Scheduler", (), {"ncores": "ncores"})
+
+    def __init__(self, threads, ends):
+        self.threads, self.ends = threads, ends
+        self.submitted, self.asked = [], 0
+
+    def sync(self, call, callback_timeout):
+        assert (call, callback_timeout) == ("ncores", 10.0)
+        self.asked += 1
+        return {f"worker {i}": count for i, count in enumerate(self.threads)}
+
+    def submit(self, do, payload, expected, i, key):
+        assert (do, payload, expected) == (executor._do, b"work", "{}")
+        self.submitted.append(i)
+        future = self.ends(i)
+        future.key = key
+        return future
+
+
+@pytest.fixture
+def connected(monkeypatch):
+    """Returns a connection to such a scheduler, and what it said."""
+    said = []
+    monkeypatch.setattr(executor, "tell", said.append)
+
+    def connect(ends, threads=(1, 1)):
+        cluster = object.__new__(executor._Cluster)
+        cluster._client = Client(threads, ends)
+        cluster._distributed = type("Distributed", (), {"KilledWorker": Killed})
+        cluster._payload, cluster._expected, cluster._address = b"work", "{}", "tcp://there:1"
+        cluster._told, cluster._workers_seen = set(), time.monotonic()
+        return cluster, said
+
+    return connect
+
+
+def results(run):
+    """What a generator yields, and what it returns."""
+    found = []
+    while True:
+        try:
+            found.append(next(run))
+        except StopIteration as end:
+            return found, end.value
+
+
+def test_a_cluster_does_every_number_and_asks_now_and_then_who_is_there(connected):
+    cluster, said = connected(lambda i: Future("", i * i))
+    run = cluster.run(range(9))
+    assert next(run) == (0, 0)
+    assert cluster._client.submitted == [0, 1, 2, 3]  # two for each of two threads
+    found, lost = results(run)
+    assert [(0, 0), *found] == [(i, i * i) for i in range(9)] and lost == []
+    assert cluster._client.asked == 1 and said == []
+
+
+def test_a_result_that_its_worker_took_along_is_asked_for_again(connected):
+    cluster, _ = connected(lambda i: Future("", i, lost=2 * (i == 1)))
+    found, lost = results(cluster.run(range(3)))
+    assert sorted(found) == [(0, 0), (1, 1), (2, 2)] and lost == []
+    assert cluster._client.asked == 3  # who is there is asked at once, each time
+
+
+def test_a_number_that_costs_worker_after_worker_is_tried_alone_and_given_up(
+    connected, monkeypatch
+):
+    tries = []
+
+    def ends(i):
+        tries.append(i)
+        deadly = i == 2 or (i == 3 and tries.count(3) == 1)  # one was next to it
+        return Future("", Killed(i) if deadly else i)
+
+    cluster, _ = connected(ends)
+    found, lost = results(cluster.run(range(5)))
+    assert sorted(found) == [(0, 0), (1, 1), (4, 4)] and lost == [2, 3]
+    tries.clear()
+
+    class There:
+        def __enter__(self):
+            return cluster
+
+        def __exit__(self, *_):
+            pass
+
+    monkeypatch.setattr(executor, "_Cluster", lambda work, address: There())
+    found = list(executor._on_cluster(None, range(5), "tcp://there:1"))
+    assert sorted(found[:3]) == [(0, 0), (1, 1), (4, 4)] and sorted(found[3:]) == [
+        (2, None),
+        (3, 3),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (ZeroDivisionError("of mine"), "cannot do the work: ZeroDivisionError: of mine"),
+        (WorkerError("not the same software"), "cannot do the work: not the same software"),
+    ],
+)
+def test_what_the_work_raises_on_a_cluster_is_told_with_its_name(connected, error, told):
+    cluster, _ = connected(lambda i: Future("", error if i == 1 else i))
+    with pytest.raises(WorkerError, match=f"the cluster at tcp://there:1 {told}"):
+        list(cluster.run(range(3)))
+
+
+def test_a_scheduler_that_goes_is_an_error_that_says_so(connected):
+    cluster, _ = connected(lambda i: Future("", i))
+    cancelled = Future("", 0)
+    cancelled.status = "cancelled"
+    for lost in (lambda: cluster._outcome(cancelled), cluster._threads):
+        cluster._client.status = "closed"
+        with pytest.raises(WorkerError, match=r"tcp://there:1 is gone \(the connection is lost\)"):
+            lost()
+    cluster._client.status = "running"
+    waiting = Future("", 0)
+    waiting.status = "pending"
+    with pytest.raises(TimeoutError):
+        cluster._outcome(waiting)
+
+    def refuses(*_, **__):
+        raise OSError("no route")
+
+    cluster._client.sync = refuses
+    with pytest.raises(WorkerError, match=r"is gone \(OSError: no route\)"):
+        cluster._threads()
+
+
+def test_workers_are_waited_for_and_threads_that_do_nothing_are_told_once(connected):
+    cluster, said = connected(None, threads=())
+    assert cluster._threads() == cluster._threads() == 0
+    (waits,) = said
+    assert "has no worker: waiting up to 300 s; `dask worker tcp://there:1 --nw" in waits
+    cluster._workers_seen -= 299.0
+    assert cluster._threads() == 0
+    cluster._workers_seen -= 2.0
+    with pytest.raises(WorkerError, match="has had no worker for 300 s"):
+        cluster._threads()
+    cluster._client.threads = (1, 1, 1)
+    assert cluster._threads() == 3 and len(said) == 1
+    cluster._client.threads = ()
+    assert cluster._threads() == 0  # it has seen some since
+    cluster._client.threads = (1, 4)
+    assert cluster._threads() == cluster._threads() == 5
+    assert len(said) == 2 and "one trial at a time, however many threads it has" in said[1]

@@ -3,25 +3,26 @@
 import copy
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from hqp_grasp.control.controller import CLIP_TOLERANCE
+from hqp_grasp.control.controller import CLIP_TOLERANCE, Step
 from hqp_grasp.control.episode import MissPolicy
 from hqp_grasp.control.forms import TOUCH_RANK, PaperForm, clip_to_limits
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import InputError, ReachError
 from hqp_grasp.experiments.record import COLUMNS
 from hqp_grasp.experiments.start import Start
-from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
+from hqp_grasp.experiments.trial import Trial, _in_transit
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, stack_of
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.touch.physical import PhysicalProbe
-from hqp_grasp.touch.simulated import SimulatedHand
+from hqp_grasp.touch.simulated import SimulatedHand, Truth
 from hqp_grasp.world.scene import Prism, Scene
 
 SEEDS = (0, 1, 2)
@@ -547,3 +548,61 @@ def test_a_physical_trial_builds_its_hand_once_and_touches_first_once(
     record = Trial(scene, stack, probes=1, probe="physical", preset=preset).run(0)
     assert record.rejected == 0
     assert len(built) == hands and len(touched) == 2
+
+
+def test_a_violation_is_the_worst_of_where_a_joint_was_sent_and_where_it_is():
+    scene = Scene()
+    trial, robot = Trial(scene, ForceTask(), probes=1), scene.articulated
+    contacts = [Contact(x, n) for x, n in zip(0.05 * np.eye(3), np.eye(3), strict=True)]
+
+    def outside(by):
+        q = robot.home.copy()
+        q[0] = robot.q_upper[0] + by
+        return q
+
+    for sent, reached, worst in ((0.02, 0.05, 0.05), (0.05, 0.02, 0.05), (-0.1, -0.1, 0.0)):
+        felt = robot.grasp(outside(reached), contacts)
+        for told, due in ((felt, worst), (Missed(Miss.STUCK, "x"), max(sent, 0.0))):
+            row = trial._row(robot, trial.stack, Touch(outside(sent), told), None, None, None)
+            assert row["limit_violation"] == pytest.approx(due)
+
+    class Hand:
+        worst: ClassVar = {"range [rad]": 0.3, "force [N]": 1.0, "speed share": 0.2} | {
+            "torque share": 0.4
+        }
+
+        def truth(self):
+            return Truth(None, None, None, None, None, 0.004, 0.0, ("f1_distal",), ())
+
+    row = trial._row(robot, trial.stack, Touch(outside(0.02), told), None, Hand(), None)
+    assert row["limit_violation"] == 0.3 and row["object_moved"] == 0.004
+    assert (row["peak_force"], row["peak_speed"], row["peak_torque"]) == (1.0, 0.2, 0.4)
+    assert row["other_links"] == "f1_distal" and row["eps_f_true"] is None
+
+
+def test_links_in_transit_are_looked_for_from_where_the_hand_is_over_the_way_it_passes():
+    class Looks(GeometricProbe):
+        ways: ClassVar = []
+
+        def in_transit(self, way):
+            self.ways.append([q.copy() for q in way])
+            return ("palm", "f1_distal")
+
+    scene = Scene()
+    probe = Looks(scene)
+    n = scene.articulated.n
+    first = Start().draw(scene, lambda _: GeometricProbe(scene), np.random.default_rng(0)).grasp
+    target, passed = np.full(n, 0.1), np.full(n, 0.2)
+    for before, begins in (
+        (Touch(np.zeros(n), first), first.q),
+        (Touch(np.full(n, 0.3), Missed(Miss.NO_TOUCH, "x")), np.full(n, 0.3)),
+    ):
+        step = Step(target, (passed,))
+        told = _in_transit(probe, [before, Touch(target, first)], step)
+        assert told == {"in_transit": "palm, f1_distal"}
+        np.testing.assert_array_equal(Looks.ways[-1], [begins, passed, target])
+    assert (
+        _in_transit(None, [before, before], step)
+        == {}
+        == _in_transit(probe, [before, before], Step(None))
+    )
