@@ -254,6 +254,15 @@ class PressedByTheNeighbour(Broken):
         self.hand.press(torque[[*range(8), 9, 10, 8]])
 
 
+class PressedByTheNeighbourToo(Broken):
+    """Each finger presses as hard as the one before it, at least."""
+
+    def press(self, torque):
+        torque = torque.copy()
+        torque[8:] = np.maximum(torque[8:], torque[[10, 8, 9]])
+        self.hand.press(torque)
+
+
 class PressedAtOnce(Broken):
     def __init__(self, hand):
         super().__init__(hand)
@@ -418,6 +427,7 @@ BROKEN = {
     contract.pressing_is_followed_slowly: [
         (IgnoredPress, "press is ignored"),
         (PressedByTheNeighbour, "press turns the wrong joint"),
+        (PressedByTheNeighbourToo, "press turns the wrong joint"),
         (PressedAtOnce, "press is not slow"),
         (TorqueOfTheNeighbour, "readings of torque are wrong: when finger_1 presses"),
         (LessIsMore, "press has the wrong sign: finger_1 was asked for"),
