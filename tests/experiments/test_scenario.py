@@ -17,7 +17,14 @@ from hqp_grasp.control.controller import Controller
 from hqp_grasp.errors import ReachError, SolverError
 from hqp_grasp.experiments import start
 from hqp_grasp.experiments.plots import FLOOR, convergence, convergence_figure
-from hqp_grasp.experiments.scenario import Settings, replay_command, run, summary, trial_of
+from hqp_grasp.experiments.scenario import (
+    Settings,
+    _physical,
+    replay_command,
+    run,
+    summary,
+    trial_of,
+)
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.world.scene import Prism, Scene
@@ -522,3 +529,45 @@ def test_an_interrupt_says_that_the_same_command_continues(monkeypatch, tmp_path
     monkeypatch.setattr(Study, "run", interrupted)
     with pytest.raises(SystemExit, match="the same command continues"):
         call(*TINY, "--out", tmp_path)
+
+
+def test_what_a_simulated_hand_adds_is_told_at_the_end_and_at_its_most():
+    nan = np.nan
+    shaped = {
+        "eps_f_true": [[9.0, 4e-4], [9.0, 2e-4], [9.0, nan]],
+        "eps_m_true": [[9.0, 1e-6], [9.0, 9e-6], [9.0, nan]],
+        "friction_demand_true": [[nan, nan]] * 3,
+        "floor_f": [[7.0, 1e-5], [7.0, 3e-5], [7.0, nan]],
+        "floor_m": [[7.0, 4e-8], [7.0, 4e-8], [7.0, nan]],
+        "object_moved": [[0.0, 1e-3], [0.0, 3e-3], [0.0, 2e-3]],
+        "peak_force": [[1.0, 2.25], [3.5, 1.0], [nan, 0.5]],
+        "peak_speed": [[0.2, 0.81], [0.3, 0.1], [nan, 0.5]],
+        "peak_torque": [[0.2, 0.31], [0.424, 0.1], [nan, 0.4]],
+    }
+    shaped = {name: np.array(values) for name, values in shaped.items()}
+    columns = {name: values.ravel() for name, values in shaped.items()}
+    assert _physical(columns, shaped) == [
+        "true     ε_f 3.0e-04 N², √ε_m 2.24 mm·N at the end, medians",
+        "floor    ε_f 2.0e-05 N², √ε_m 0.20 mm·N: what noise makes of balance",
+        "hand     at most 3.50 N at a fingertip, 81% of a joint's speed limit, "
+        "42% of its torque limit",
+        "         the object moved by 2.00 mm in the median",
+    ]
+    fixed = shaped | {"object_moved": np.zeros((3, 2)), "eps_f_true": np.full((3, 2), nan)}
+    assert [line.split()[0] for line in _physical(columns, fixed)] == ["floor", "hand"]
+    assert _physical({"eps_f": columns["eps_f_true"]}, shaped) == []
+
+
+def test_starts_and_ends_are_told_by_their_medians_means_and_worst(ran):
+    table = pq.read_table(ran[0] / "probes.parquet")
+    rows = {line[:22].strip(): line[22:] for line in summary(table).splitlines()}
+    for label, name, form in (
+        ("net force², N²", "eps_f", lambda v: f"{np.median(v):.2e} (≤ {v.max():.2e})"),
+        ("flexion angle, rad", "eps_k", lambda v: f"{v.mean():.3f} ± {v.std():.3f}"),
+        ("elevation, °", "elevation_deg", lambda v: f"{v.mean():.2f} ± {v.std():.2f}"),
+    ):
+        values = table[name].to_numpy().reshape(TRIALS, -1)
+        told = [rows[label][:22].strip(), rows[label][22:].strip()]
+        assert told == [form(values[:, 0]), form(values[:, -1])]
+    moment = 1e3 * np.sqrt(table["eps_m"].to_numpy().reshape(TRIALS, -1)[:, 0])
+    assert f"{np.median(moment):.2e} (≤ {moment.max():.2e})" in rows["net moment, mm·N"]
