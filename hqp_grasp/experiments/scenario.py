@@ -347,7 +347,8 @@ def _physical(columns: dict[str, np.ndarray], shaped: dict[str, np.ndarray]) -> 
         if len(at_end[force]):
             f, m = np.median(at_end[force]), 1e3 * np.sqrt(np.median(at_end[moment]))
             lines.append(label.format(f"ε_f {f:.1e} N², √ε_m {m:.2f} mm·N"))
-    most = {name: np.nanmax(columns[name].astype(float)) for name in TRUE_COLUMNS}
+    peaks = ("peak_force", "peak_speed", "peak_torque")
+    most = {name: np.nanmax(columns[name].astype(float)) for name in peaks}
     lines.append(
         f"hand     at most {most['peak_force']:.2f} N at a fingertip, {most['peak_speed']:.0%} of "
         f"a joint's speed limit, {most['peak_torque']:.0%} of its torque limit"

@@ -21,13 +21,17 @@ from hqp_grasp.experiments.replay import (
     GREY,
     NORMAL_COLOUR,
     Frame,
+    camera,
+    describe,
     frames_of,
+    frames_of_pick,
     frames_of_rows,
     placed,
     rows_of,
     shapes,
     write_replay,
 )
+from hqp_grasp.grasp import Touch
 
 pytest.importorskip("viser", reason="no viser: pip install 'hqp_grasp[view]'")
 import browser
@@ -301,6 +305,55 @@ def test_the_errors_of_the_probe_stand_beside_it(record, played):
     assert f"{record.rows[3]['eps_f']:.2e} N²" in text
     assert f"{1e3 * record.rows[3]['eps_m'] ** 0.5:.2e} mm·N" in text
     assert f"holds if µ ≥ {record.rows[3]['friction_demand']:.2f}" in text
+
+
+def test_what_is_held_is_drawn_where_it_is_with_its_forces_and_their_sum(record, tmp_path):
+    """Six millimetres a newton, towards the contacts; what is held has no errors."""
+    touches = [Touch(grasp.q, grasp) for grasp in record.grasps[:2]]
+    x, f = touches[1].felt.positions, np.array([[0, 0, 2.0], [1.0, 0, 0], [0, -3.0, 0]])
+    contacts = np.column_stack([x, touches[1].felt.normals, f]).ravel().tolist()
+    place = [0.7, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
+    look = {"time": 1.0, "phase": "lift", "load": 4.5, "strength": 6.0, "normal": [2.0, 1.0, 3.0]}
+    look |= {"contacts": contacts, "q": touches[1].felt.q.tolist(), "object": place}
+    blind = look | {"time": 1.25, "contacts": [], "q": [], "normal": []}
+    frames = frames_of_pick(record.rows[:2], touches, [look, blind, blind | {"time": 1.75}])
+    assert [frame.held and frame.held.duration for frame in frames] == [None, None, 0.25, 0.5, 0.0]
+    np.testing.assert_array_equal(frames[3].q, frames[2].q)  # where nothing was felt: as before
+    assert describe(frames, 2) == [
+        "lift: 4.50 N carried",
+        "asked for 6.0 N a contact, in the mean",
+        "felt 2.0, 1.0, 3.0 N",
+        "forces drawn 6 mm a newton",
+    ]
+    assert (
+        describe(frames, 3)[2].strip() == "felt" and describe(frames, 1)[0] == "probe 1 of 1: touch"
+    )
+    write_replay(SCENE, frames, tmp_path / "held.html")
+    duration, told = messages((tmp_path / "held.html").read_text(encoding="utf-8"))
+    assert duration == pytest.approx(2.75)
+    nodes = scene_at(told, 2.1)
+    arrows = nodes["/hand/forces"]["points"].reshape(-1, 2, 3)
+    assert arrows[:, 1] == pytest.approx(x, abs=ROUNDED)
+    assert arrows[:, 1] - arrows[:, 0] == pytest.approx(0.006 * f, abs=ROUNDED)
+    net = nodes["/hand/net_force"]["points"].reshape(-1, 2, 3)[0]
+    assert net[0] == pytest.approx(x.mean(axis=0), abs=ROUNDED)
+    assert net[1] - net[0] == pytest.approx(0.006 * f.sum(axis=0), abs=ROUNDED)
+    assert len(nodes["/hand/normals"]["points"]) == len(nodes["/hand/felt"]["points"]) == 0
+    thing = nodes[f"/hand/body_{SCENE.model.body('object').id}"]
+    assert [*thing["position"], *thing["wxyz"]] == pytest.approx(place, abs=ROUNDED)
+    assert len(scene_at(told, 2.3)["/hand/forces"]["points"]) == 0
+
+
+def test_one_looks_at_hand_and_object_from_the_side():
+    q = SCENE.articulated.home
+    palm = SCENE.articulated.palm(q)[0]
+    view = camera(SCENE, q)
+    np.testing.assert_allclose(view.middle, (palm + SCENE.position) / 2.0)
+    assert view.size == pytest.approx(max(0.3, 2.0 * np.linalg.norm(palm - SCENE.position)))
+    right, up, back = view.axes
+    np.testing.assert_allclose(view.axes @ view.axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.cross(right, up), back, atol=1e-12)
+    assert right[2] == pytest.approx(0.0) and up[2] > 0.0 and back[1] < 0.0
 
 
 def test_a_lost_grasp_turns_grey_and_the_reason_is_written(record, tmp_path):
