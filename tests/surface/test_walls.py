@@ -208,6 +208,14 @@ def test_points_that_a_fresh_touch_contradicts_are_forgotten():
     np.testing.assert_allclose(memory.normals[0], [-0.5, np.sqrt(0.75), 0.0])
 
 
+@pytest.mark.parametrize(("beyond", "stays"), [(1.9e-4, True), (2.2e-4, False), (-2.2e-4, False)])
+def test_a_fifth_of_a_millimetre_beyond_a_tangent_plane_contradicts_it(beyond, stays):
+    """Either way: of two points that cannot both be of a convex object the older one goes."""
+    old = touched([[0.05, 0.0], [-0.05, 0.0]], [[1.0, 0.0], [-1.0, 0.0]])
+    new = touched([[0.05 + beyond, 0.01]], [[1.0, 0.0]])
+    assert Felt.of([old, new]).probes.tolist() == ([0, 0, 1] if stays else [0, 1])
+
+
 def test_misses_leave_no_trace():
     first = on_circle(0.04, 0.0, 120.0, 240.0)
     missed = Touch(first.q_target, Missed(Miss.NO_TOUCH, "finger_1"))
