@@ -6,6 +6,8 @@ import functools
 import importlib
 import json
 import sys
+from enum import Enum
+from pathlib import Path
 
 import mink
 import numpy as np
@@ -255,3 +257,59 @@ def test_limits_of_this_package_are_known(scene, trial):
     limits = StepLimit(), ConfigurationLimit(scene.articulated), VelocityLimit([1.0] * 11, 1.0)
     stack = trial.stack.within(*limits, mink.ConfigurationLimit(scene.model))
     assert Fingerprint(dataclasses.replace(trial, stack=stack)).unknown == []
+
+
+@pytest.mark.parametrize(
+    ("there", "here", "said"),
+    [
+        ({"a": 1, "b": {"c": [1, 2]}}, {"a": 1, "b": {"c": [1, 2]}}, []),
+        ({"a": 1}, {"a": 2}, ["a is 1 there, 2 here"]),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, ["a.b[1] is 2 there, 3 here"]),
+        ({"a": [1]}, {"a": [1, 2]}, ["a is [1] there, [1, 2] here"]),
+        ({"a": 1}, {"b": 1}, ["a is 1 there, None here", "b is None there, 1 here"]),
+        ({"a": "x" * 38}, {"a": "y"}, [f"a is '{'x' * 38}' there, 'y' here"]),
+        ({"a": "x" * 39}, {"a": "y"}, ["a differs"]),
+        ({"a": "sha256:1"}, {"a": "z"}, ["a differs"]),
+        ({"a": [{"b": 1}]}, {"a": [{"b": "1"}]}, ["a[0].b is 1 there, '1' here"]),
+    ],
+)
+def test_differences_are_told_by_their_place_and_both_values_where_they_are_short(
+    there, here, said
+):
+    assert list(differences(there, here)) == said
+
+
+class Kind(Enum):
+    ONE = 1
+
+
+@pytest.mark.parametrize(
+    ("value", "described"),
+    [
+        (None, None),
+        (True, True),
+        ("text", "text"),
+        (Kind.ONE, "Kind.ONE"),
+        (np.int64(3), 3),
+        (np.bool_(True), 1),
+        (np.float64(0.5), 0.5),
+        (np.inf, "inf"),
+        (Path("a") / "b", "a/b"),
+        ({1: (2, 3)}, {"1": [2, 3]}),
+        (frozenset({"b", "a"}), ["a", "b"]),
+    ],
+)
+def test_plain_values_are_described_as_json_can_hold_them(value, described):
+    assert Fingerprint(value).parts["trial"] == described
+
+
+def test_arrays_count_by_their_type_shape_and_numbers_and_what_holds_itself_ends():
+    one = Fingerprint(np.zeros((2, 3))).parts["trial"]
+    assert one.startswith("float64[2, 3] sha256:")
+    for other in (np.zeros((3, 2)), np.zeros((2, 3), np.float32), np.eye(3)[:2]):
+        assert Fingerprint(other).parts["trial"] != one
+    endless = [1]
+    endless.append(endless)
+    assert Fingerprint(endless).parts["trial"] == [1, "itself"]
+    twice = [0]
+    assert Fingerprint([twice, twice]).parts["trial"] == [[0], [0]]  # beside is not within
