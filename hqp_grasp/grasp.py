@@ -121,6 +121,9 @@ class Grasp:
     offset: np.ndarray | None = None  # c₀ (N,); zero when None
     other_links: tuple[str, ...] = ()  # geoms beside the contact points that touch the object
     frames: tuple[Frame, ...] = ()  # one for each group of contact points
+    model: object = field(
+        default=None, repr=False
+    )  # compiled robot, read by mink's tasks; not stored
     _J3: np.ndarray = field(init=False, repr=False)  # (k, 3, n) view of jacobian
     _of_links: np.ndarray = field(init=False, repr=False)  # (k, 3, n) the same without rolling
 
@@ -165,6 +168,10 @@ class Grasp:
         if self.rolling is not None:
             set_field(self, "rolling", as_array("Grasp.rolling", self.rolling, (3 * k, n)))
             set_field(self, "_of_links", self._J3 - self.rolling.reshape(k, 3, n))
+
+    def __getstate__(self) -> dict[str, object]:
+        """What pickling keeps: not the model, which is large and the robot's own."""
+        return self.__dict__ | {"model": None}
 
     @property
     def k(self) -> int:

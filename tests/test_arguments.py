@@ -62,6 +62,7 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.Level.equal: {"A": np.eye(2), "b": np.ones(2)},
     hg.MemorylessForm: {},
     hg.MinkLimit: {"limit": mink.ConfigurationLimit(SCENE.model)},
+    hg.MinkTask: {"task": POSTURE},
     hg.Missed: {"reason": hg.Miss.STUCK, "where": "finger"},
     hg.MomentTask: {},
     hg.Noise: {},

@@ -74,7 +74,7 @@ class Controller:
         instance("Controller.robot, such as Scene().articulated,", self.robot, Robot)
         if self.budget is not None:
             object.__setattr__(self, "budget", whole("Controller.budget", self.budget, 1))
-        stack = Stack.of(self.stack)
+        stack = Stack.of(self.stack).on(self.robot.model)
         if not any(limit.priority is Priority.CAP for limit in stack.limits):
             stack = stack.within(StepLimit())
         if not any(limit.priority is Priority.RANGE for limit in stack.limits):

@@ -100,7 +100,9 @@ class ClippedForm(Form):
         instance("ClippedForm.projection", self.projection, Projection)
 
     def plan(self, stack: Stack, episode: Episode) -> Plan:
-        return _clipped(self.projection, Stack.law_levels, stack, episode.stand, "clipped")
+        hqp = HQP("active-set", rank_tolerance=self.projection.rank_tolerance)
+        levels = lambda stack, grasp: stack.damped(stack.law_levels(grasp), grasp, hqp)  # noqa: E731
+        return _clipped(self.projection, levels, stack, episode.stand, "clipped")
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from hqp_grasp.errors import InputError, flag, instance, not_negative, positive
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks.limit import Priority
+from hqp_grasp.tasks.mink_rows import require_width, rows
 
 Tasks = BaseTask | Sequence[BaseTask]  # that share a level
 
 CAPS = (mink.VelocityLimit, mink.FreeJointVelocityLimit)
-ROUNDING = 1e-12  # [–] share of a dense Hessian's largest eigenvalue that counts as zero
 
 
 def solve_ik(
@@ -81,7 +81,7 @@ def ik_levels(
     for task in () if constraints is None else _listed(constraints, "constraints"):
         _require(task, mink.Task, "constraints")
         J, error = task.compute_jacobian(configuration), task.compute_error(configuration)
-        _require_width(task, J, nv)
+        require_width(task, J, nv)
         levels.append(Level.equal(J, -task.gain * error, type(task).__name__))
     dampings = [0.0] * len(levels)
     for priority in _listed(priorities, "priorities"):
@@ -104,7 +104,7 @@ def _limit_level(limit: mink.Limit, configuration: mink.Configuration, dt: float
     G, h = limit.compute_qp_inequalities(configuration, dt)
     if G is None or h is None:
         G, h = np.zeros((0, nv)), np.zeros(0)
-    _require_width(limit, G, nv)
+    require_width(limit, G, nv)
     kept = h != np.inf
     if not kept.all():
         G, h = G[kept], h[kept]
@@ -122,40 +122,14 @@ def _rows(
     tasks: Sequence[BaseTask], configuration: mink.Configuration
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """W (m, nv), e (m,) and μ of tasks at equal priority."""
-    Ws, es, mu = [], [], 0.0
+    Ws, es, mu = [np.zeros((0, configuration.nv))], [np.zeros(0)], 0.0
     for task in tasks:
         _require(task, BaseTask, "priorities")
-        W, e, own = task.compute_qp_residual(configuration) or _dense(task, configuration)
-        _require_width(task, W, configuration.nv)
-        asks = W.any(axis=1) | (e != 0.0)
-        if not asks.all():  # rows without a cost ask for nothing
-            W, e = W[asks], e[asks]
+        W, e, own = rows(task, configuration)
         Ws.append(W)
         es.append(e)
         mu += own
-    if len(tasks) == 1:
-        return Ws[0], es[0], mu
-    return np.concatenate([np.zeros((0, configuration.nv)), *Ws]), np.concatenate([[], *es]), mu
-
-
-def _dense(
-    task: BaseTask, configuration: mink.Configuration
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rows whose least squares is ½ Δqᵀ H Δq + cᵀ Δq up to a constant: H = WᵀW, c = −Wᵀe."""
-    name = type(task).__name__
-    H, c = task.compute_qp_objective(configuration)
-    if not (np.isfinite(H).all() and np.isfinite(c).all()):
-        raise InputError(f"{name}: its objective (H, c) is not finite")
-    value, V = np.linalg.eigh(H)
-    zero = ROUNDING * np.abs(value).max(initial=0.0)
-    kept = value > zero
-    if (value < -zero).any():
-        raise InputError(f"{name}: its Hessian has the negative eigenvalue {value[0]:.1e}")
-    slope = V.T @ c
-    if (np.abs(slope[~kept]) > np.sqrt(ROUNDING) * np.abs(slope).max(initial=0.0)).any():
-        raise InputError(f"{name}: its objective falls for ever, c is outside the range of H")
-    root = np.sqrt(value[kept])
-    return root[:, None] * V[:, kept].T, -slope[kept] / root, 0.0
+    return np.concatenate(Ws), np.concatenate(es), mu
 
 
 def _listed(values: object, argument: str) -> list[Any]:
@@ -171,12 +145,4 @@ def _require(value: object, kind: type, argument: str) -> None:
     if not isinstance(value, kind):
         raise InputError(
             f"{argument} must hold mink.{kind.__name__} objects; got {type(value).__name__}"
-        )
-
-
-def _require_width(owner: object, rows: np.ndarray, nv: int) -> None:
-    if rows.ndim != 2 or rows.shape[1] != nv:
-        raise InputError(
-            f"{type(owner).__name__} has rows of shape {rows.shape}, the configuration {nv} "
-            "degrees of freedom; was it built for another model?"
         )

@@ -49,13 +49,16 @@ def fitting(
     too. Where the whole way fits, it is gone, and those below take the room that it leaves.
     """
     projection = Projection(rank_tolerance=hqp.rank_tolerance)
-    levels, x, less = _shared(asked, stack, grasp, projection, gain)
+    search = HQP("active-set", rank_tolerance=hqp.rank_tolerance)
+    held = lambda levels: stack.damped(levels, grasp, search)  # noqa: E731
+    levels, x, less = _shared(lambda s: held(asked(s)), stack, grasp, projection, gain)
     if not below:
         return levels, x, less
     if less:
         rest = scaled(below)
-        together = lambda share: [*asked(share), *rest(share / gain)]  # noqa: E731
+        together = lambda share: held([*asked(share), *rest(share / gain)])  # noqa: E731
         return _shared(together, stack, grasp, projection, gain)
+    below = held([*levels, *below])[len(levels) :]
     more = projection.solve([*levels, *below]).x - x
     room = room_left(x, more, stack, grasp)
     left = [Level.equal(v.A, v.A @ x + room * (v.upper - v.A @ x), v.name) for v in below]

@@ -24,6 +24,7 @@ import llvmlite.binding
 import mink
 import mujoco
 import numpy as np
+from mink.tasks import BaseTask
 
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
@@ -99,7 +100,7 @@ class Fingerprint:
             return {f.name: getattr(value, f.name) for f in fields(value)} | {
                 "robot": value.articulated
             }
-        if isinstance(value, mink.Limit) and _owner(type(value)) == "mink":
+        if isinstance(value, mink.Limit | BaseTask) and _owner(type(value)) == "mink":
             # What mink keeps in private is derived, or scratch memory.
             return {k: v for k, v in vars(value).items() if not k.startswith("_")}
         if is_dataclass(value):

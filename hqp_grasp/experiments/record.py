@@ -377,7 +377,8 @@ def law_columns(stack: Stack, grasp: Grasp | None, solution: Solution | None) ->
     no level for a law ("paper" composes force and moment into one step), both are None; and so is
     the error where the law is undefined at this grasp.
     """
-    levels = {level.name: level for level in solution.levels} if solution is not None else {}
+    found = () if solution is None else solution.levels
+    levels = {level.name.removesuffix(", damped"): level for level in found}
     row: dict[str, object] = {}
     for tasks in stack.priorities:
         level = levels.get(" + ".join(task.name for task in tasks))

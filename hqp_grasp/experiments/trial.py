@@ -194,7 +194,8 @@ class Trial:
     def touches(self, began: Began) -> Iterator[tuple[dict[str, object], Touch | None]]:
         """The row of every touch as it is made; the last, without a touch, tells of giving up."""
         scene, hand, touching = began.first.scene, began.hand, began.touching
-        robot, controller, stack = scene.articulated, self.controller(scene), Stack.of(self.stack)
+        robot, controller = scene.articulated, self.controller(scene)
+        stack = Stack.of(controller.stack)
         history = [Touch(began.first.grasp.q, began.felt)]
         yield self._row(robot, stack, history[0], None, hand, touching), history[0]
         while len(history) <= self.probes:

@@ -144,13 +144,15 @@ class HQP:
         levels: Sequence[Level],
         damping: float | Sequence[float],
         reference: np.ndarray | None = None,
+        motion: np.ndarray | None = None,
     ) -> list[Level]:
         """Return levels that ask only for what is reached with x held back; then `solve` those.
 
         In their order each level with equalities is solved, under those above, beside the rows
         √λ x = √λ reference, and asks from then on for the A x that was found. So the levels stay
         strict, limits hold, and near a loss of rank x stays short. On equalities alone the answer
-        is Projection(damping=λ)'s; its q_c is the `reference` (n,), here 0 unless given.
+        is Projection(damping=λ)'s; its q_c is the `reference` (n,), here 0 unless given. With
+        `motion` M (N, n) it is M x that is held back, such as all joints by the independent ones.
 
         `damping`: λ ≥ 0 in the squared units of A, one for all or one for each level; levels of
         inequalities only, and levels with λ = 0, stay as they are. Raises SolverError where the
@@ -166,14 +168,17 @@ class HQP:
         toward = np.zeros(n) if reference is None else _numbers(reference)
         if toward.shape != (n,) or not np.isfinite(toward).all():
             raise InputError(f"reference must be {n} finite numbers; got {reference!r}")
+        hold = np.eye(n) if motion is None else _numbers(motion)
+        if hold.ndim != 2 or hold.shape[1] != n or not np.isfinite(hold).all():
+            raise InputError(f"motion must be finite rows over {n} unknowns; got {motion!r}")
         held: list[Level] = []
         for level, square in zip(levels, np.broadcast_to(each, len(levels)), strict=True):
             if square == 0.0 or level.is_inequality:
                 held.append(level)
                 continue
             root = np.sqrt(square)
-            A = np.concatenate([level.A, root * np.eye(n)])
-            lower, upper = (np.append(b, root * toward) for b in (level.lower, level.upper))
+            A = np.concatenate([level.A, root * hold])
+            lower, upper = (np.append(b, root * hold @ toward) for b in (level.lower, level.upper))
             value = level.A @ self.solve([*held, Level(A, lower, upper)]).certified_x
             equal = level.lower == level.upper
             lower = np.where(equal, value, np.minimum(level.lower, value))

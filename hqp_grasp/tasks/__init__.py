@@ -8,7 +8,7 @@ from hqp_grasp.tasks.letters import stack_of
 from hqp_grasp.tasks.limit import Limit, MinkLimit, Priority
 from hqp_grasp.tasks.moment import MomentTask
 from hqp_grasp.tasks.posture import PostureTask
-from hqp_grasp.tasks.stack import Stack, Task
+from hqp_grasp.tasks.stack import MinkTask, Stack, Task
 
 __all__ = [
     "ContactSpaceTask",
@@ -17,6 +17,7 @@ __all__ = [
     "KinematicTask",
     "Limit",
     "MinkLimit",
+    "MinkTask",
     "MomentTask",
     "PostureTask",
     "Priority",

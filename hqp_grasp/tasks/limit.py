@@ -14,6 +14,7 @@ import numpy as np
 from hqp_grasp.errors import InputError, positive
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks.mink_rows import configuration_of
 
 
 class Priority(IntEnum):
@@ -64,9 +65,9 @@ class MinkLimit(Limit):
 
     def level(self, grasp: Grasp) -> Level:
         # mink's VelocityLimit reads no configuration, and keeps no model to make one from.
-        configuration: Any = self.model and mink.Configuration(self.model, q=grasp.q_full)
-        G, h = self.limit.compute_qp_inequalities(configuration, self.dt)
         name = type(self.limit).__name__
+        configuration: Any = self.model and configuration_of(self.model, grasp.q_full, name)
+        G, h = self.limit.compute_qp_inequalities(configuration, self.dt)
         if G is None or h is None:
             return Level(np.zeros((0, grasp.n)), np.zeros(0), np.zeros(0), name)
         A = G @ grasp.coupling

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,11 +10,15 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import mink
+import mujoco
 import numpy as np
+from mink.tasks import BaseTask
 
-from hqp_grasp.errors import InputError, flag, positive
+from hqp_grasp.errors import InputError, flag, instance, positive
 from hqp_grasp.grasp import Grasp
+from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks import mink_rows
 from hqp_grasp.tasks.limit import Limit, MinkLimit
 
 
@@ -56,19 +61,118 @@ class Task(ABC):
         """What noise of the contacts makes of eᵀe where it vanishes, on average."""
         return 0.0
 
+    def damping(self, grasp: Grasp) -> float:
+        """μ of μ‖Δq‖² over all joints, which holds the law's motion back [unit of A, squared]."""
+        return 0.0
+
     def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
         """The equality rows (A, b) asked of x = Δq over one probe: jacobian·x = −gain·error."""
         A = self.weight * np.asarray(self.jacobian(grasp), dtype=float)
         b = (-self.weight * self.gain) * np.asarray(self.error(grasp), dtype=float)
         return A, b
 
-    def __rshift__(self, other: Task | Stack) -> Stack:
+    def __rshift__(self, other: Law) -> Stack:
         """`a >> b`: b subject to a (the paper's a ▷ b)."""
         return Stack.of(self) >> other
 
-    def __add__(self, other: Task | Stack) -> Stack:
+    def __rrshift__(self, other: BaseTask) -> Stack:
+        return Stack.of(other) >> self
+
+    def __add__(self, other: Law) -> Stack:
         """`a + b`: both at the same priority."""
         return Stack.of(self) + other
+
+    def __radd__(self, other: BaseTask) -> Stack:
+        return Stack.of(other) + self
+
+
+@dataclass(frozen=True, eq=False)
+class MinkTask(Task):
+    """A task of mink: its rows W Δq_full = e, carried over to the independent joints, W C x = e.
+
+    Its cost, gain and damping are its own; `gain` and `weight` come on top of them.
+    """
+
+    task: BaseTask
+    model: mujoco.MjModel | None = None  # that the task speaks of; None: the robot's
+    name: str = ""  # in records; "": its class, and the frame it is of
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        instance("MinkTask.task", self.task, BaseTask)
+        if self.model is not None:
+            instance("MinkTask.model", self.model, mujoco.MjModel)
+        if not isinstance(self.name, str):
+            raise InputError(f"MinkTask.name must be a text; got {self.name!r}")
+        if not self.name:
+            object.__setattr__(self, "name", _name_of(self.task))
+
+    def on(self, model: mujoco.MjModel) -> MinkTask:
+        """The same task of this model, unless it has one; InputError where it cannot be."""
+        model = self.model or model
+        self._asked(mink.Configuration(model))
+        return replace(self, model=model)
+
+    def error(self, grasp: Grasp) -> np.ndarray:
+        """The task's error (r,) [its own units], of the rows that have a cost."""
+        return self._measured(grasp)[0]
+
+    def jacobian(self, grasp: Grasp) -> np.ndarray:
+        """∂error/∂q (r, n), by the independent joints."""
+        return self._measured(grasp)[1] @ np.asarray(grasp.coupling)
+
+    def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
+        """The rows (W C, e) of mink's objective ‖W Δq_full − e‖²."""
+        W, e, _ = self._asked(self._configuration(grasp))
+        return self.weight * W @ np.asarray(grasp.coupling), self.weight * self.gain * e
+
+    def damping(self, grasp: Grasp) -> float:
+        """mink's Levenberg–Marquardt μ."""
+        return self.weight**2 * self._asked(self._configuration(grasp))[2]
+
+    def _asked(self, configuration: mink.Configuration) -> tuple[np.ndarray, np.ndarray, float]:
+        """W (r, N), e (r,) and μ of mink's objective."""
+        with self._refusing():
+            return mink_rows.rows(self.task, configuration)
+
+    def _measured(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
+        """Error (r,) and its Jacobian (r, N) over all joints."""
+        configuration, task = self._configuration(grasp), self.task
+        if not isinstance(task, mink.Task):
+            W, e, _ = self._asked(configuration)
+            return -e, W
+        with self._refusing():
+            e, J = task.compute_error(configuration), task.compute_jacobian(configuration)
+        counts = np.broadcast_to(task.cost != 0.0, e.shape)
+        return e[counts], J[counts]
+
+    def _configuration(self, grasp: Grasp) -> mink.Configuration:
+        model = self.model or grasp.model
+        if not isinstance(model, mujoco.MjModel):
+            raise InputError(
+                f"the law {self.name!r} needs the robot's model, which this grasp does not tell: "
+                "give MinkTask(task, robot.model)"
+            )
+        return mink_rows.configuration_of(model, grasp.q_full, f"the law {self.name!r}")
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """What mink refuses, such as a frame that is not there, is refused by the law's name."""
+        try:
+            yield
+        except mink.MinkError as error:
+            raise InputError(f"the law {self.name!r}: {error}") from error
+
+
+def _name_of(task: BaseTask) -> str:
+    """Of a FrameTask of the site left_palm, "mink_frame_left_palm", so that no two are alike."""
+    words = re.sub(r"(?<!^)(?=[A-Z])", "_", type(task).__name__.removesuffix("Task")).lower()
+    parts = ["mink", words]
+    parts += [str(getattr(task, of)) for of in ("frame_name", "root_name") if hasattr(task, of)]
+    if isinstance(task, mink.FrameTask | mink.RelativeFrameTask):
+        asks = {"position": task.cost[:3].any(), "orientation": task.cost[3:].any()}
+        parts += [what for what, asked in asks.items() if asked and not all(asks.values())]
+    return "_".join(parts)
 
 
 @dataclass(frozen=True)
@@ -99,15 +203,26 @@ class Stack:
         if twice is not None:
             raise InputError(
                 f"two laws of this stack are named {twice!r}, and records tell laws apart by name; "
-                "make one a subclass with a `name` of its own"
+                "make one a subclass with a `name` of its own, or a MinkTask(task, name=…)"
             )
 
     @classmethod
-    def of(cls, laws: Task | Stack) -> Stack:
-        """A stack of one law, or the stack itself."""
+    def of(cls, laws: Law) -> Stack:
+        """A stack of one law, which may be a task of mink, or the stack itself."""
         return laws if isinstance(laws, Stack) else cls(((_task(laws),),))
 
-    def __rshift__(self, other: Task | Stack) -> Stack:
+    def on(self, model: mujoco.MjModel) -> Stack:
+        """The same laws, mink's tasks among them of this model, whatever grasps tell.
+
+        Raises InputError where they speak of frames that it does not have, or have no target yet.
+        """
+        priorities = tuple(
+            tuple(task.on(model) if isinstance(task, MinkTask) else task for task in tasks)
+            for tasks in self.priorities
+        )
+        return replace(self, priorities=priorities)
+
+    def __rshift__(self, other: Law) -> Stack:
         """`a >> b`: b subject to a."""
         below = Stack.of(other)
         return replace(
@@ -117,7 +232,10 @@ class Stack:
             hold_contacts=self.hold_contacts and below.hold_contacts,
         )
 
-    def __add__(self, other: Task | Stack) -> Stack:
+    def __rrshift__(self, other: BaseTask) -> Stack:
+        return Stack.of(other) >> self
+
+    def __add__(self, other: Law) -> Stack:
         """`a + b`: b at the priority of the last laws of a."""
         beside = Stack.of(other)
         if len(beside.priorities) != 1:
@@ -128,6 +246,9 @@ class Stack:
             limits=self.limits + beside.limits,
             hold_contacts=self.hold_contacts and beside.hold_contacts,
         )
+
+    def __radd__(self, other: BaseTask) -> Stack:
+        return Stack.of(other) + self
 
     def within(self, *limits: Limit | mink.Limit) -> Stack:
         """The same laws below these limits too; mink's are taken as they are."""
@@ -152,11 +273,25 @@ class Stack:
     @property
     def name(self) -> str:
         """The laws' names, "force ▷ moment ▷ kinematic"."""
-        return " ▷ ".join(" + ".join(t.name for t in tasks) for tasks in self.priorities)
+        return " ▷ ".join(map(_name, self.priorities))
 
     def levels(self, grasp: Grasp) -> list[Level]:
-        """The whole hierarchy: caps, ranges, clearances, contacts, laws."""
-        return self.limit_levels(grasp) + self.law_levels(grasp)
+        """The whole hierarchy: caps, ranges, clearances, contacts, `damped` laws."""
+        return self.damped(self.limit_levels(grasp) + self.law_levels(grasp), grasp)
+
+    def damped(self, levels: list[Level], grasp: Grasp, hqp: HQP | None = None) -> list[Level]:
+        """The levels, those of laws with a damping μ asking only for what is reached with it.
+
+        That is the A x which minimises ‖A x − b‖² + μ‖C x‖² under the levels above, see
+        `HQP.damped`; `hqp` solves, the compiled search unless given.
+        """
+        laws = {_name(tasks): tasks for tasks in self.priorities}
+        dampings = [
+            sum(task.damping(grasp) for task in laws.get(level.name, ())) for level in levels
+        ]
+        if not any(dampings):
+            return levels
+        return (hqp or HQP("active-set")).damped(levels, dampings, motion=grasp.coupling)
 
     def limit_levels(self, grasp: Grasp) -> list[Level]:
         """One level for each priority of limits, caps first."""
@@ -182,9 +317,18 @@ def _tuple(name: str, value: object) -> tuple:
     return value
 
 
+def _name(tasks: Iterable[Task]) -> str:
+    """Of the level that these laws share."""
+    return " + ".join(task.name for task in tasks)
+
+
 def _task(value: object) -> Task:
+    if isinstance(value, BaseTask):
+        return MinkTask(value)
     if not isinstance(value, Task):
-        raise InputError(f"{value!r} is no control law: give a task, or a stack of them")
+        raise InputError(
+            f"{value!r} is no control law: give a task, of mink too, or a stack of them"
+        )
     return value
 
 
@@ -228,3 +372,6 @@ def _joined(levels: Iterable[Level]) -> Level:
         np.concatenate([p.upper for p in parts]),
         " + ".join(p.name for p in parts),
     )
+
+
+Law = Task | BaseTask | Stack

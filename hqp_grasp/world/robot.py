@@ -544,6 +544,7 @@ class Robot:
             offset=self.offset,
             other_links=other_links,
             frames=(Frame(hand, *self.palm(q), self.palm_jacobian(q)),),
+            model=self.model,
         )
 
     @property

@@ -683,6 +683,15 @@ def test_each_level_may_have_a_damping_of_its_own():
     assert_same_point(HQP().solve(held).x, [1.0, 2.0])
 
 
+def test_what_is_held_back_may_be_another_motion_than_x():
+    """min (x − 2)² + λ ‖(x, 2x) − (3, 6)‖², by hand: x = (2 + 15 λ) / (1 + 5 λ)."""
+    level, M = Level.equal([[1.0]], [2.0]), np.array([[1.0], [2.0]])
+    held = HQP().damped([level], 0.5, motion=M)
+    assert_same_point(HQP().solve(held).x, [2.0 / 3.5])
+    held = HQP().damped([level], 0.5, reference=[3.0], motion=M)
+    assert_same_point(HQP().solve(held).x, [9.5 / 3.5])
+
+
 def test_the_rank_tolerance_decides_what_counts_as_independent():
     problem = near_singular(np.random.default_rng(0), 1e-6, limits=False)
     strict, truncated = solve(problem), solve(problem, rank_tolerance=1e-3)
@@ -876,6 +885,12 @@ def test_damping_that_is_no_damping_is_refused(damping):
 def test_a_reference_that_is_no_point_is_refused(reference):
     with pytest.raises(InputError, match="reference must be 2 finite numbers"):
         HQP().damped(built([box(2, 1.0)]), 0.1, reference)
+
+
+@pytest.mark.parametrize("motion", [[1.0, 1.0], [[1.0]], [[np.nan, 1.0]], 1.0, "all"])
+def test_a_motion_that_is_no_matrix_over_the_unknowns_is_refused(motion):
+    with pytest.raises(InputError, match="motion must be finite rows over 2 unknowns"):
+        HQP().damped(built([box(2, 1.0)]), 0.1, motion=motion)
 
 
 def test_levels_of_different_width_are_refused_with_their_widths():
