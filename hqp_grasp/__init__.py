@@ -29,6 +29,7 @@ from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.history import load_history, save_history
 from hqp_grasp.judge.judge import Judge, Judged
 from hqp_grasp.tasks import (
+    AlignTask,
     ContactSpaceTask,
     ContactTask,
     ForceTask,
@@ -60,6 +61,7 @@ from hqp_grasp.world.scene import Scene
 __all__ = [
     "GRIP_LAWS",
     "HQP",
+    "AlignTask",
     "Body",
     "ClippedForm",
     "ConfigurationLimit",

@@ -32,6 +32,7 @@ POSTURE.set_target(CONFIGURATION.q)
 
 # A sound call of everything that is built or called with a user's values, not of what only answers.
 CALLS: dict[Callable[..., Any], dict[str, Any]] = {
+    hg.AlignTask: {},
     hg.Body: {"file": "robots/bhand/bhand.xml"},
     hg.ClippedForm: {},
     hg.ConfigurationLimit: {"robot": ROBOT},

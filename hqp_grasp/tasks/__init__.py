@@ -1,5 +1,6 @@
 """The control laws, one file each; every one reads a Grasp and yields rows."""
 
+from hqp_grasp.tasks.align import AlignTask
 from hqp_grasp.tasks.contact import ContactTask
 from hqp_grasp.tasks.contact_space import ContactSpaceTask
 from hqp_grasp.tasks.force import ForceTask
@@ -11,6 +12,7 @@ from hqp_grasp.tasks.posture import PostureTask
 from hqp_grasp.tasks.stack import MinkTask, Stack, Task
 
 __all__ = [
+    "AlignTask",
     "ContactSpaceTask",
     "ContactTask",
     "ForceTask",
