@@ -162,7 +162,7 @@ def _pairs(robot: Robot) -> np.ndarray:
         u, v = int(weld[a]), int(weld[b])
         if u == v or above[a] == v or above[b] == u:
             continue
-        if (a << 16) + b in excluded or (b << 16) + a in excluded:
+        if (a << 16) + b in excluded:  # MuJoCo has the lesser body first, whatever was written
             continue
         pairs.append((one, other))
     return np.reshape(pairs, (-1, 2)).astype(int)
