@@ -8,6 +8,8 @@ import socket
 import subprocess
 import sys
 from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import ClassVar
 
 import browser
 import numpy as np
@@ -19,7 +21,8 @@ from hqp_grasp.errors import MissingExtraError
 from hqp_grasp.experiments import scenario
 from hqp_grasp.experiments.fingerprint import Fingerprint
 from hqp_grasp.experiments.record import secures, verdicts
-from hqp_grasp.experiments.view import Results, _numbers, serve
+from hqp_grasp.experiments.replay import _quiet_server
+from hqp_grasp.experiments.view import Results, Viewer, _numbers, serve
 
 pytest.importorskip("viser", reason="no viser: pip install 'hqp_grasp[view]'")
 
@@ -168,6 +171,122 @@ def test_a_ghost_of_other_starts_is_refused(folders):
         port = taken.getsockname()[1]
         with pytest.raises(hg.InputError, match=r"has seed 0, .*other_seed has 1"):
             serve(folders / "strict", folders / "other_seed", port=port)
+
+
+# ---------------------------------------------------------------- the page, without a browser
+
+
+@pytest.fixture(scope="module")
+def viewer(folders):
+    """A page with a ghost beside it, and the server that nobody is connected to."""
+    with _quiet_server() as server:
+        yield Viewer(server, Results.open(folders / "strict"), Results.open(folders / "paper"))
+
+
+def test_sliders_reach_from_the_first_trial_and_probe_to_the_last(viewer):
+    assert (viewer._trial.min, viewer._trial.max, viewer._trial.value) == (0, TRIALS - 1, 0)
+    assert (viewer._probe.min, viewer._probe.max, viewer._probe.value) == (0, PROBES, 0)
+    assert viewer._play.value is False
+
+
+def test_the_numbers_and_curves_of_both_studies_follow_the_sliders(viewer, folders):
+    viewer._trial.value, viewer._probe.value = 3, 2
+    viewer.refresh()
+    rows = [Results.open(folders / name).rows(3) for name in ("strict", "paper")]
+    said = viewer._numbers.content.splitlines()
+    assert said[0] == "| trial 3, probe 2 |strict|paper (ghost)|" and said[1] == "|---|---|---|"
+    cells = [f"{of[2]['eps_f']:.3e} N²" for of in rows]
+    assert f"| eps_f |{cells[0]}|{cells[1]}|" in said
+    probes, *curves, now = viewer._plot.data
+    np.testing.assert_array_equal(probes, np.arange(PROBES + 1))
+    due = []
+    for of in rows:
+        for name, scale in (
+            ("eps_f", lambda v: v),
+            ("eps_m", lambda v: 1e3 * np.sqrt(v)),
+            ("eps_k", lambda v: v),
+        ):
+            values = [np.nan if row[name] is None else scale(row[name]) for row in of]
+            due.append(np.log10(np.maximum(values, 1e-16)))
+    np.testing.assert_allclose(curves, due)
+    assert np.flatnonzero(np.isfinite(now)).tolist() == [2] and now[2] == 0.0
+    # A slider has two ends even where there is one: what lies beyond shows the last.
+    viewer._trial.value, viewer._probe.value = TRIALS + 3, PROBES + 3
+    viewer.refresh()
+    assert viewer._numbers.content.startswith(f"| trial {TRIALS - 1}, probe {PROBES} |")
+
+
+def test_curves_are_told_apart_by_name_colour_and_dashes(viewer):
+    first, *lines, now = viewer._series()
+    assert first == {"label": "probe"} and now["label"] == "shown"
+    errors = ["ε_f [N²]", "√ε_m [mm·N]", "ε_k [rad]"]
+    assert [line["label"] for line in lines] == errors + [f"{error} (ghost)" for error in errors]
+    assert [line["stroke"] for line in lines[:3]] == [line["stroke"] for line in lines[3:]]
+    assert len({line["stroke"] for line in lines}) == 3
+    assert [bool(line["dash"]) for line in lines] == [False] * 3 + [True] * 3
+
+
+def test_a_trial_is_shown_at_the_probe_that_ended_it(viewer, monkeypatch):
+    nothing = dict.fromkeys(("eps_f", "eps_m", "eps_k"))
+    outcomes = enumerate(["touch", "gave up: x", None])
+    ended = [nothing | {"probe": i, "outcome": why} for i, why in outcomes]
+    monkeypatch.setattr(viewer, "_load", lambda results, trial: (None, [], ended))
+    viewer.show(2)
+    assert (viewer._trial.value, viewer._probe.value) == (2, 1)
+    monkeypatch.setattr(viewer, "_load", lambda results, trial: (None, [], ended[2:]))
+    viewer.show(1)
+    assert (viewer._trial.value, viewer._probe.value) == (1, 0)
+
+
+def test_the_heading_counts_good_and_secure_trials_and_names_what_changed(viewer, folders):
+    results = Results.open(folders / "strict")
+    heads = viewer._heading().split("\n\n")
+    bad = sum(len(trials) for trials in results.failures.values())
+    assert heads[0] == (
+        f"**{folders / 'strict'}**: {TRIALS} trials of {PROBES} probes, {TRIALS - bad} good, "
+        f"{results.secure} secure, seed 0"
+    )
+    assert heads[1:] == [f"ghost: **{folders / 'paper'}**, the same starts"]
+
+
+def test_failures_have_a_button_each_up_to_two_dozen(viewer, monkeypatch):
+    class Gui:
+        groups: ClassVar = {}
+
+        def add_button_group(self, label, trials):
+            self.groups[label] = trials
+            return SimpleNamespace(on_click=clicks.append)
+
+    clicks, shown = [], []
+    failures = {"error": (), "lost": (1, 4), "not balanced": tuple(range(30))}
+    monkeypatch.setattr(viewer, "_results", SimpleNamespace(failures=failures))
+    monkeypatch.setattr(viewer, "show", shown.append)
+    viewer._list_failures(Gui())
+    assert Gui.groups == {
+        "lost: 2": ["1", "4"],
+        "not balanced: 30, the first 24": [str(i) for i in range(24)],
+    }
+    clicks[0](SimpleNamespace(target=SimpleNamespace(value="4")))
+    assert shown == [4]
+
+
+def test_playing_steps_through_the_probes_and_begins_again(viewer, monkeypatch):
+    seen = []
+
+    def tick(seconds):
+        seen.append(viewer._probe.value)
+        if len(seen) > 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", tick)
+    viewer._probe.value, viewer._play.value = PROBES - 1, True
+    with pytest.raises(KeyboardInterrupt):
+        viewer.play()
+    assert seen == [PROBES - 1, PROBES, 0, 1, 2]
+    viewer._play.value = False
+
+
+# ---------------------------------------------------------------- what is refused
 
 
 def test_a_port_in_use_is_said_and_no_other_is_taken(folders):
