@@ -3,6 +3,8 @@
 A palm slides up and down, tilted; two fingers of one joint hang from it, with heavy round tips.
 """
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -431,6 +433,42 @@ def test_a_touch_that_misses_opens_slowly_and_goes_back(scene):
     assert opening[3] == pytest.approx(2.0 * np.abs(closed - opening[2]).max(), rel=0.02)
     np.testing.assert_allclose(back[2], before - [0.0, 0.35, 0.35], atol=3e-3)
     assert back[3] == 0.4
+
+
+def test_a_touch_that_misses_on_a_way_ends_at_the_last_posture_that_was_passed(scene):
+    """The next one approaches from there; its fingers are open."""
+    scene = narrowed(scene, "{ left = [-0.8, 0.35], right = [-0.8, 0.35] }")
+    hand = Noting(scene)
+    hand.place(np.array([0.28, 0.1, 0.1]))
+    way = [np.array([0.2, 0.1, 0.1]), np.array([0.24, 0.05, 0.1])]
+    target = np.array([0.26, 0.1, 0.1])
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(target, via=way)
+    assert isinstance(felt, hg.Missed) and felt.reason is hg.Miss.NO_TOUCH
+    opening, *passed, _, back = [call for call in hand.calls if call[0] == "move"]
+    assert opening[3] == 0.3 and {call[3] for call in (*passed, back)} == {0.4}
+    open_ = np.array([0.0, 0.35, 0.35])
+    for call, q in zip(passed, (*way, target), strict=True):
+        np.testing.assert_allclose(call[2], q - open_, atol=1e-9)
+    np.testing.assert_allclose(back[2], way[-1] - open_, atol=1e-9)
+    assert opening[2][0] == pytest.approx(0.28, abs=3e-3)  # fingers open before the palm moves
+
+
+def test_a_hand_that_does_not_open_waits_before_it_goes_back(scene):
+    class Stuck(Noting):
+        waits = ()
+
+        def wait(self, duration):
+            self.waits += ((len(self.calls), duration),)
+            read = super().wait(duration)
+            return replace(read, fault="stuck") if len(self.calls) == 1 else read
+
+    hand = Stuck(scene)
+    hand.place(np.array([0.28, 0.1, 0.1]))
+    felt = hg.PhysicalProbe(hand, scene.articulated).touch(np.array([0.25, 0.1, 0.1]))
+    assert felt == hg.Missed(hg.Miss.STUCK, "stuck")
+    assert len(hand.calls) == 3  # opening, opening once more, and back
+    slices = [duration for calls, duration in hand.waits if calls == 1]
+    assert 0.5 in slices  # no longer than half of the watchdog's time at once
 
 
 def narrowed(scene, ranges):
