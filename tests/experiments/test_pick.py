@@ -14,7 +14,7 @@ import hqp_grasp as hg
 from hqp_grasp.errors import InputError, ModelError
 from hqp_grasp.experiments.lifting import lift
 from hqp_grasp.experiments.pick import COLUMNS, LOOK
-from hqp_grasp.experiments.picking import kinds, summary
+from hqp_grasp.experiments.picking import PickSettings, kinds, pick_of, run, summary
 from hqp_grasp.experiments.plots import picked_figure
 from hqp_grasp.experiments.replay import frames_of_pick
 from hqp_grasp.world.imperfections import Fault
@@ -264,3 +264,72 @@ def test_failures_are_told_by_kind(done):
     said = summary(table, 0.5)
     assert "1 × a contact uses friction of\n" in said and "1 × SolverError" in said
     assert np.isfinite(done.row["slip_mm"])
+
+
+def test_a_summary_tells_medians_and_the_most_and_reasons_without_their_figures(done):
+    rows = [
+        {"lifted": True, "set_down": True, "felt_weight": 0.51, "sum_normal": 30.0, "slip_mm": 0.5}
+        | {"slip_deg": 0.25, "touches": 10, "limit_violation": 0.0, "reason": None},
+        {"lifted": True, "set_down": False, "felt_weight": 0.45, "sum_normal": 41.0, "slip_mm": 2.0}
+        | {"slip_deg": 1.0, "touches": 7, "limit_violation": 1e-3, "reason": "it tilts, by 3 mm"},
+        {"lifted": False, "set_down": False, "felt_weight": None, "sum_normal": 20.0}
+        | {"slip_mm": None, "slip_deg": None, "touches": 9, "reason": "it tilts, by 5 mm"},
+        {"lifted": False, "set_down": False, "felt_weight": 0.5, "error": "SolverError: x"},
+    ]
+    none = dict.fromkeys(COLUMNS)
+    table = pa.Table.from_pylist([none | row | {"trial": i} for i, row in enumerate(rows)])
+    assert summary(table, 0.5).splitlines()[1:] == [
+        "lifted   2 of 4",
+        "set down 1 of 4 within 1 cm of where it stood",
+        "weight   0.500 kg felt in the median, of 0.5; off by 2.0% in the median, 10.0% at most",
+        "forces   30.0 N of normal force in the median, 41.0 at most",
+        "slip     1.25 mm in the median, 2.00 at most, 0.62° and 1.00",
+        "touches  9 in the median, 10 at most",
+        "limits   largest violation 0.001 rad",
+        "reason   2 × it tilts, by",
+        "error    1 × SolverError",
+    ]
+    assert kinds(table) == {"not where it stood": [1, 2], "ended by SolverError": [3]}
+    alone = pa.Table.from_pylist([none | {"lifted": False, "set_down": False, "trial": 0}])
+    assert "weight" not in summary(alone, 0.5) and "slip     –, –" in summary(alone, 0.5)
+
+
+def test_settings_of_a_pick_are_its_worlds_and_its_grips():
+    settings = PickSettings(
+        mass=0.7, force=4.0, friction=0.3, actual_friction=0.8, lift=0.05, timestep=0.002, probes=9
+    )
+    p = pick_of(SCENE, settings)
+    assert (p.force, p.friction, p.height, p.trial.probes) == (4.0, 0.3, 0.05, 9)
+    world = p.trial.probe
+    assert (world.support, world.mass, world.friction, world.timestep) == (
+        *("pedestal", 0.7),
+        *(0.8, 0.002),
+    )
+    for replayed in (-1, 20):
+        with pytest.raises(InputError, match=r"--replay takes a trial, 0 … 19; got"):
+            run("cylinder", SCENE, PickSettings(replay=replayed))
+
+
+def test_a_pick_ends_once_a_return_finds_the_hand_back_where_it_was(done, monkeypatch):
+    """Within a milliradian of a grasp felt before; not by one that misses, or is elsewhere."""
+    p, q = pick(), np.linspace(0.1, 0.2, 11)
+    contacts = [hg.Contact([0.05, 0, 0.2], [1, 0, 0])]
+
+    def felt(at):
+        return hg.Grasp(at, contacts, np.zeros((3, 11)))
+
+    missed = hg.Missed(hg.Miss.NO_TOUCH, "finger_1")
+    back, other = {"planner": "return to the best grasp"}, {"planner": "surface felt"}
+    made = [
+        ({"planner": None}, hg.Touch(q, felt(q))),
+        (other, hg.Touch(q, felt(q + 0.5))),  # there, but by no return
+        (back, hg.Touch(q, missed)),
+        (back, hg.Touch(q + 2e-3, felt(q + 2e-3))),
+        (back, hg.Touch(q + 0.5 + 0.9e-3, felt(q))),
+        (other, hg.Touch(q, felt(q))),
+    ]
+    monkeypatch.setattr(hg.Trial, "touches", lambda trial, began: iter(made))
+    history, rows = p._find(None)
+    assert len(history) == len(rows) == 5 and rows[-1] is made[4][0]
+    monkeypatch.setattr(hg.Trial, "touches", lambda trial, began: iter([*made[:2], (other, None)]))
+    assert len(p._find(None)[0]) == 2
