@@ -9,7 +9,7 @@ import numpy as np
 
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
-from hqp_grasp.surface.felt import steadied
+from hqp_grasp.surface.denoise import denoised
 from hqp_grasp.world.robot import Robot
 
 IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE)  # what the palm withdraws from
@@ -118,9 +118,9 @@ class Episode:
         """How many touches have missed since the last that did not."""
         return [isinstance(touch.felt, Grasp) for touch in reversed(self.touches)].index(True)
 
-    def steadied(self) -> Episode:
-        """The same episode, noise averaged out over all touches of one place."""
-        touches = steadied(self.touches)
+    def denoised(self) -> Episode:
+        """The same episode, with the likeliest normals that one convex object can have."""
+        touches = denoised(self.touches)
         pairs = zip(self.touches, touches, strict=True)
         grasps = (new.felt for old, new in pairs if old.felt is self.grasp)
         grasp = next(felt for felt in grasps if isinstance(felt, Grasp))

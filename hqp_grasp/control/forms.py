@@ -150,7 +150,7 @@ class HierarchyForm(Form):
 
     def plan(self, stack: Stack, episode: Episode) -> Plan:
         begin = time.perf_counter()
-        episode = episode.steadied()
+        episode = episode.denoised()
         progress = Progress.of(stack, episode.touches)
         back = progress.way_back(episode.left, episode.stand)
         if back is not None:

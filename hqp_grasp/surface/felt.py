@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Grasp, Touch
-from hqp_grasp.surface.outline import wrapped
 
 CONTRADICTION = 2e-4  # [m] a point may lie beyond the tangent plane of another
 SLACK = 2e-6  # [m] rounding of what was felt
 SURE = 2.5  # standard errors within which noise explains what was felt
-SAME_PLACE = 1.5e-3  # [m] from one tip's centre to another's, of which noise is averaged out
 LEAST_NOISE = 1e-6  # [rad]
-KNOWN = 5e-5  # [m] to which kinematics know where a tip's centre was
 SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
 UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which tips decide
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
@@ -57,9 +54,7 @@ class Felt:
         noise = np.array([c.noise for _, grasp in hits for c in grasp.contacts])
         tip = np.array([c.tip_radius for _, grasp in hits for c in grasp.contacts])
         by_balls = np.array([c.stretch is None for _, grasp in hits for c in grasp.contacts])
-        beyond = n @ x.T - (n * x).sum(axis=1)[:, None]
-        apart = beyond > CONTRADICTION + doubt(x, noise, tip)
-        kept = ~((apart | apart.T) & (probes > probes[:, None])).any(axis=1)
+        kept = ~contradicted(x, n, probes, noise, tip)
         return cls(x[kept], n[kept], probes[kept], noise[kept], tip[kept], by_balls[kept], widest)
 
     @cached_property
@@ -88,58 +83,13 @@ class Felt:
         return np.asarray(axis * np.sign(axis[np.abs(axis).argmax()]))
 
 
-def steadied(history: Sequence[Touch]) -> tuple[Touch, ...]:
-    """The same history, noise averaged out over all touches of one place, by any finger.
-
-    They are those with the tips' centres within SAME_PLACE whose normals differ by no more than
-    noise explains. Each counts by the inverse of its variance. What has no noise stays as it is.
-    """
-    contacts = [c for t in history if isinstance(t.felt, Grasp) for c in t.felt.contacts]
-    if not any(c.noise for c in contacts):
-        return tuple(history)
-    noise = np.maximum([c.noise for c in contacts], LEAST_NOISE)
-    n, rho = np.array([c.normal for c in contacts]), np.array([[c.tip_radius] for c in contacts])
-    centers = np.array([c.position for c in contacts]) + rho * n
-    near = np.linalg.norm(centers[:, None] - centers, axis=-1) < SAME_PLACE
-    alike = np.linalg.norm(n[:, None] - n, axis=-1) <= SURE * np.hypot(noise[:, None], noise)
-    weight = (near & alike) / noise**2
-    n = weight @ n
-    n /= np.linalg.norm(n, axis=1)[:, None]
-    noise = 1.0 / np.sqrt(weight.sum(axis=1))
-    averaged = (
-        replace(c, position=x, normal=normal, noise=float(sigma))
-        for c, x, normal, sigma in zip(contacts, centers - rho * n, n, noise, strict=True)
-    )
-    steady = []
-    for touch in history:
-        if isinstance(touch.felt, Grasp):
-            those = tuple(next(averaged) for _ in touch.felt.contacts)
-            touch = replace(touch, felt=replace(touch.felt, contacts=those))
-        steady.append(touch)
-    return tuple(steady)
-
-
-def narrowed(c: np.ndarray, t: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angles t (N,) [rad] of normals felt with noise, within what convexity leaves; their errors.
-
-    A ball's centre c (N, 2) [m], which kinematics tell, moves along a convex curve: all the other
-    centres lie behind the tangent there. So neighbours bound the normal from either side, the
-    closer, the more there are of them.
-    What noise does not explain is left as it is felt.
-    """
-    d = c - c[:, None]
-    far = np.linalg.norm(d, axis=-1)
-    tells = far > KNOWN
-    slack = np.arcsin(KNOWN / np.where(tells, far, KNOWN))
-    bearing = wrapped(np.arctan2(d[..., 1], d[..., 0]) - t[:, None])
-    right, left = tells & (bearing < 0.0), tells & (bearing > 0.0)
-    low = np.where(right, bearing + 0.5 * np.pi - slack, -np.pi).max(axis=1)
-    high = np.where(left, bearing - 0.5 * np.pi + slack, np.pi).min(axis=1)
-    turn = np.where(low > high, 0.5 * (low + high), np.clip(0.0, low, high))
-    left_over = np.maximum(high - low, 0.0) / np.sqrt(12.0)  # of a uniform distribution
-    explained = np.abs(turn) <= SURE * noise  # else it is kinematics that err
-    error = np.where(explained, np.minimum(noise, np.maximum(left_over, LEAST_NOISE)), noise)
-    return wrapped(t + np.where(explained, turn, 0.0)), error
+def contradicted(
+    x: np.ndarray, n: np.ndarray, probes: np.ndarray, noise: np.ndarray, tip: np.ndarray
+) -> np.ndarray:
+    """Which contacts (N,) newer ones contradict: one lies beyond the tangent plane of the other."""
+    beyond = n @ x.T - (n * x).sum(axis=1)[:, None]
+    apart = beyond > CONTRADICTION + doubt(x, noise, tip)
+    return np.asarray(((apart | apart.T) & (probes > probes[:, None])).any(axis=1))
 
 
 def doubt(x: np.ndarray, noise: np.ndarray, tip: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hqp_grasp.grasp import Grasp
-from hqp_grasp.surface.felt import LEANING, SAME_NORMAL, SLACK, Felt, balls, narrowed
+from hqp_grasp.surface.felt import LEANING, SAME_NORMAL, SLACK, Felt
 from hqp_grasp.surface.outline import Outline, directions
 
 DISTINCT = 10  # ways, at most
@@ -50,13 +50,6 @@ class Walls:
         n = felt.normals[across] @ frame.T
         n /= np.linalg.norm(n, axis=1)[:, None]
         t = np.arctan2(n[:, 1], n[:, 0])
-        if felt.noise.any():
-            tip = felt.tip_radii[across]
-            c = x + tip[:, None] * n
-            t, noise = narrowed(c, t, felt.noise[across])
-            n = directions(t)
-            x = c - tip[:, None] * n
-            R = balls(x, n, noise, tip, felt.widest)
         corners, sharp = _corners(x, n, t)
         within = felt.positions[~across] @ frame.T  # of end faces and their rims
         c = np.concatenate([x - R[:, None] * n, corners, within])

@@ -9,7 +9,7 @@ import pytest
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.surface.believed import believed
-from hqp_grasp.surface.felt import KNOWN, SAME_PLACE, SLACK, UNDECIDED, Felt, narrowed, steadied
+from hqp_grasp.surface.felt import SLACK, UNDECIDED, Felt
 from hqp_grasp.surface.outline import Outline, directions, summing_to_zero, wrapped
 from hqp_grasp.surface.rounded import Rounded
 from hqp_grasp.surface.walls import Walls
@@ -260,37 +260,6 @@ def noisy(history, noise, rng):
     return Touch(history.q_target, dataclasses.replace(history.felt, contacts=tuple(contacts)))
 
 
-def test_touches_of_one_place_are_averaged_by_the_inverse_of_their_variance():
-    rng, true = np.random.default_rng(1), on_circle(0.05, 0.0, 120.0, 240.0)
-    off, told = [], []
-    for _ in range(40):
-        steady = steadied([noisy(true, noise, rng) for noise in (0.01, 0.01, 0.02, 0.02)])
-        felt = steady[0].felt
-        for c in felt.contacts:
-            told.append(c.noise)
-            center = c.position + TIP * c.normal
-            assert np.linalg.norm(center) == pytest.approx(0.05 + TIP, abs=1e-12)
-        off.append(felt.normals - true.felt.normals)
-    across = np.sqrt((np.array(off) ** 2).sum(axis=-1).mean() / 2.0)
-    assert across == pytest.approx(0.01 / np.sqrt(2.5), rel=0.2)
-    assert np.median(told) == pytest.approx(0.01 / np.sqrt(2.5))  # some are too far off to count
-
-
-def test_places_and_faces_that_differ_are_not_averaged():
-    rng = np.random.default_rng(2)
-    apart = np.degrees(1.5 * SAME_PLACE / (0.05 + TIP))
-    one, other = (noisy(on_circle(0.05, a, 120.0 + a), 1e-3, rng) for a in (0.0, apart))
-    edge = noisy(on_square(0.04, 0.0, ("corner", 0, 0.0), ("corner", 0, 5.0)), 1e-3, rng)
-    for history in ([one, other], [edge]):
-        for before, after in zip(history, steadied(history), strict=True):
-            np.testing.assert_allclose(after.felt.normals, before.felt.normals, atol=1e-12)
-
-
-def test_what_has_no_noise_stays_as_it_is():
-    history = [on_circle(0.05, 0.0, 120.0, 240.0), on_circle(0.05, 0.1, 120.0, 240.0)]
-    assert all(a is b for a, b in zip(history, steadied(history), strict=True))
-
-
 def test_noise_neither_sharpens_a_circle_nor_has_it_forgotten():
     rng, true = np.random.default_rng(3), on_circle(0.05, 0.0, 120.0, 240.0)
     turned = on_circle(0.05, 4.0, 124.0, 244.0)
@@ -298,25 +267,6 @@ def test_noise_neither_sharpens_a_circle_nor_has_it_forgotten():
     memory = Felt.of(history)
     assert len(memory.radii) == 12
     assert memory.radii.min() > 0.03
-
-
-def test_convexity_bounds_normals_felt_with_noise():
-    """Along a face they become exact between its ends; on a circle they stay what noise allows."""
-    rng, sigma, rho = np.random.default_rng(0), 0.05, 0.008
-    along = np.linspace(-0.02, 0.02, 9)
-    face = np.column_stack([along, np.full(9, 0.03 + rho)])
-    t = 0.5 * np.pi + sigma * rng.standard_normal(9)
-    angle, error = narrowed(face, t, np.full(9, sigma))
-    assert np.abs(angle - 0.5 * np.pi)[1:-1].max() < KNOWN / 0.005 < np.abs(t - 0.5 * np.pi).max()
-    assert error[1:-1].max() < 0.2 * sigma
-    true = np.linspace(-np.pi, np.pi, 40, endpoint=False)
-    circle = (0.05 + rho) * np.column_stack([np.cos(true), np.sin(true)])
-    t = true + sigma * rng.standard_normal(40)
-    angle, error = narrowed(circle, t, np.full(40, sigma))
-    off = np.abs((angle - true + np.pi) % (2.0 * np.pi) - np.pi)
-    between = np.pi / 40 + KNOWN / 0.009  # half the way to the next
-    assert off.max() < between + 1e-3
-    assert error.max() <= sigma
 
 
 # ---------------------------------------------------------------- any number of contacts
