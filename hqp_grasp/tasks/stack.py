@@ -193,11 +193,13 @@ class Stack:
             raise InputError(f"Stack.limits must be limits; got {self.limits!r}")
         priorities = _tuple("priorities", self.priorities)
         full = priorities and all(isinstance(p, tuple) and p for p in priorities)
-        if not full or not all(isinstance(t, Task) for p in self.priorities for t in p):
+        if not full or not all(isinstance(t, Task | BaseTask) for p in priorities for t in p):
             raise InputError(
                 "Stack.priorities must be tuples of control laws, none of them empty; "
                 f"got {self.priorities!r}"
             )
+        taken = tuple(tuple(map(_task, tasks)) for tasks in priorities)
+        object.__setattr__(self, "priorities", taken)
         names = [task.name for task in self.tasks]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:

@@ -236,6 +236,7 @@ def test_tasks_of_mink_compose_from_both_sides():
     assert (com >> (ForceTask() >> place)).name == "mink_com ▷ force ▷ mink_frame_palm"
     assert (com + Stack.of(place)).name == "mink_com + mink_frame_palm"
     assert all(isinstance(task, MinkTask) for task in Stack.of(com).tasks)
+    assert Stack(((com,), (place, ForceTask()))).name == "mink_com ▷ mink_frame_palm + force"
 
 
 def test_each_task_has_a_name_that_says_what_it_is_of():
