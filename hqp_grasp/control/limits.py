@@ -124,15 +124,21 @@ class ClearanceLimit(Limit):
 
 @dataclass(frozen=True, eq=False)
 class RetreatLimit(Limit):
-    """The palm moves back along its approach axis by at least `distance` [m]."""
+    """A group's palm moves back along its approach axis by at least `distance` [m].
+
+    Below 0 it comes on.
+    """
 
     robot: Robot
     distance: float  # [m]
+    group: int = 0
     priority = Priority.CLEARANCE
 
     def level(self, grasp: Grasp) -> Level:
-        approach = self.robot.palm(grasp.q)[1][:, 2]
-        A = approach @ self.robot.palm_jacobian(grasp.q)[:3]
+        approach = self.robot.palm(grasp.q, self.group)[1][:, 2]
+        A = approach @ self.robot.palm_jacobian(grasp.q, self.group)[:3]
+        if self.distance < 0.0:
+            return Level(A[None], np.array([-self.distance]), np.array([np.inf]), "advance")
         return Level(A[None], np.array([-np.inf]), np.array([-self.distance]), "retreat")
 
 

@@ -25,8 +25,9 @@ def reach(
     R_palm: np.ndarray,
     keep: Sequence[int],
     homing: float = HOMING,
+    group: int = 0,
 ) -> np.ndarray | None:
-    """Joints (n,) [rad], from q (n,) on, that bring the palm to p (3,) [m], R (3, 3), world.
+    """Joints (n,) [rad], from q (n,) on, that bring a palm to p (3,) [m], R (3, 3), world.
 
     The joints `keep` stay; of the others those that the palm leaves free go home by the share
     `homing` of the way at a step. None where the arm cannot go there.
@@ -35,7 +36,7 @@ def reach(
     free = np.array([j for j in range(robot.n) if j not in keep], dtype=int)
     one = np.eye(robot.n)
     for _ in range(MAX_STEPS):
-        p_now, R_now = robot.palm(q)
+        p_now, R_now = robot.palm(q, group)
         error = np.concatenate([p_palm - p_now, _turn(R_now, R_palm)])
         if np.abs(error).max() < TOLERANCE:
             return q
@@ -44,7 +45,7 @@ def reach(
         levels = [
             Level(one, lower, upper),
             Level.equal(one[list(keep)], np.zeros(len(keep))),
-            Level.equal(robot.palm_jacobian(q), error),
+            Level.equal(robot.palm_jacobian(q, group), error),
             Level.equal(one[free], homing * (robot.home - q)[free]),
         ]
         found = hqp.solve(levels)

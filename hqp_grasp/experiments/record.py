@@ -294,8 +294,8 @@ def felt_row(
     robot: Robot, stack: Stack, grasp: Grasp, solution: Solution | None = None
 ) -> dict[str, object]:
     """The columns that a grasp fills, and the laws' levels in the step that led there."""
-    adduction = robot.description.adduction
-    angle = None if adduction is None else float(np.degrees(grasp.q[robot.index(adduction)]))
+    spread = robot.groups[0].adduction
+    angle = None if spread is None else float(np.degrees(grasp.q[spread]))
     row = empty_row(robot, stack) | {
         "eps_f": ForceTask().potential(grasp),
         "eps_m": MomentTask().potential(grasp),

@@ -42,7 +42,7 @@ def check(path: str | Path, hand: str | None = None, picture: str | Path | None 
             "",
             *_contact_points(robot),
             "",
-            *_palm(robot),
+            *_palms(robot),
             "",
             *_self_collisions(robot, clearance),
         ]
@@ -203,20 +203,23 @@ def _link(robot: Robot, i: int) -> str:
     return robot.model.body(int(robot.model.geom_bodyid[robot.geoms[i][0]])).name
 
 
-def _palm(robot: Robot) -> list[str]:
-    about = robot.description
-    arm = [robot.joints[j] for j in robot.arm]
-    carried = "six virtual joints" if arm == list(CARRIAGE) else ", ".join(arm)
-    lines = [f"arm      {carried or 'none: the hand is placed where a start says'}"]
-    body, p, R = robot._palm
-    place = (
-        f"palm = {{ body = {robot.model.body(body).name!r}, pos = {_row(p)}, "
-        f"approach = {_row(R[:, 2])}, opposition = {_row(R[:, 0])} }}"
-    ).replace("'", '"')
-    if about.hand.palm is None:
-        lines += ["palm     none given; found from how the fingers close. To fix it, add", place]
-    else:
-        lines.append(place)
+def _palms(robot: Robot) -> list[str]:
+    about, lines = robot.description, []
+    for group, said in zip(robot.groups, about.grasping, strict=True):
+        if len(robot.groups) > 1:
+            lines.append(f"group    {group.name}")
+        arm = [robot.joints[j] for j in group.arm]
+        carried = "six virtual joints" if arm == list(CARRIAGE) else ", ".join(arm)
+        lines.append(f"arm      {carried or 'none: the hand is placed where a start says'}")
+        if said.palm is None:
+            lines.append("palm     none given; found from how the fingers close. To fix it, add")
+        p, R = group.p_palm, group.R_palm
+        lines.append(
+            (
+                f"palm = {{ body = {robot.model.body(group.palm_body).name!r}, pos = {_row(p)}, "
+                f"approach = {_row(R[:, 2])}, opposition = {_row(R[:, 0])} }}"
+            ).replace("'", '"')
+        )
     if about.workspace is None:
         lines += ["workspace  none given; amid the tips at home. To fix it, add"]
     lines.append(f"workspace = {_row(np.array(robot.workspace))}")
@@ -259,9 +262,11 @@ def draw(robot: Robot, path: str | Path) -> None:
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
     axes.scatter(*x.T, color="tab:orange")
     axes.quiver(*x.T, *ways.T, length=0.04, color="tab:orange", label="closing")
-    p, R = robot.palm(robot.home)
-    axes.quiver(*p, *R[:, 2], length=0.08, color="tab:blue", label="approach")
-    axes.quiver(*p, *R[:, 0], length=0.05, color="tab:green", label="opposition")
+    for g in range(len(robot.groups)):
+        p, R = robot.palm(robot.home, g)
+        again = "_" if g else ""  # a label that the legend leaves out
+        axes.quiver(*p, *R[:, 2], length=0.08, color="tab:blue", label=again + "approach")
+        axes.quiver(*p, *R[:, 0], length=0.05, color="tab:green", label=again + "opposition")
     for point, place in zip(robot.description.contact_points, x, strict=True):
         axes.text(*place, point.name)
     axes.set_aspect("equal")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,11 +74,13 @@ class Start:
     adduction: tuple[float, float] = (np.radians(10.0), np.radians(90.0))  # [rad]
     elevation: tuple[float, float] = (np.radians(30.0), np.radians(50.0))  # [rad] below horizontal
     offset: tuple[float, float] = (-0.18, 0.18)  # [m] of the palm from the object, in x and in y
+    facing: tuple[float, float] = (-np.radians(20.0), np.radians(20.0))
+    # [rad] of several palms, seen from above, each from facing the others
     advance: float = 0.01  # [m] the palm comes nearer by, while the fingers do not reach
     max_draws: int = 500  # before the object counts as out of reach
 
     def __post_init__(self) -> None:
-        for name in ("adduction", "elevation", "offset"):
+        for name in ("adduction", "elevation", "offset", "facing"):
             low, high = as_array(f"Start.{name}", getattr(self, name), (2,)).tolist()
             if low > high:
                 raise InputError(f"Start.{name} must be a range (low, high); got {(low, high)}")
@@ -96,27 +98,25 @@ class Start:
         `probe_in` gives the probe that touches in a scene.
         """
         robot = scene.articulated
-        if self == Start() and robot.description.start:
-            return replace(self, **robot.description.start).draw(scene, probe_in, rng)
+        described = {**robot.description.start, **robot.description.hand.start}
+        if self == Start() and described:
+            return replace(self, **described).draw(scene, probe_in, rng)
         told: Counter[str] = Counter()
         kinds: Counter[Miss | str] = Counter()
         for rejected in range(self.max_draws):
             if rejected == ALIKE and len(kinds) == 1:
                 break
-            adduction = rng.uniform(*self.adduction)
-            elevation = rng.uniform(*self.elevation)
-            offset = np.array([-abs(rng.uniform(*self.offset)), rng.uniform(*self.offset)])
-            drawn = float(np.linalg.norm(offset)) / np.cos(elevation)
-            heading = float(np.arctan2(-offset[1], -offset[0]))
-            hand = _open_hand(robot, adduction)
+            hand = _open_hand(robot, [rng.uniform(*self.adduction) for _ in robot.groups])
+            places = [self._drawn(robot, g, rng) for g in range(len(robot.groups))]
             if hand is None:
                 told[SPREAD] += 1
                 kinds[SPREAD] += 1
                 continue
-            reach = _reach(robot, hand[0]) + _extent(scene)
-            distance = drawn - self.advance * np.ceil((drawn - reach) / self.advance)
-            place = _Place(elevation, heading, distance)
-            found = self._first_touch(scene, probe_in, *hand, place)
+            for g, place in enumerate(places):
+                reach = _reach(robot, hand[0], g) + _extent(scene)
+                nearer = self.advance * np.ceil((place.distance - reach) / self.advance)
+                places[g] = replace(place, distance=place.distance - nearer)
+            found = self._first_touch(scene, probe_in, *hand, places)
             if not isinstance(found, _Rejected):
                 return FirstTouch(*found, rejected)
             told[found.told] += 1
@@ -129,21 +129,34 @@ class Start:
             told,
         )
 
+    def _drawn(self, robot: Robot, group: int, rng: np.random.Generator) -> _Place:
+        """Where a palm comes from: several of them face one another."""
+        elevation = rng.uniform(*self.elevation)
+        if len(robot.groups) == 1:
+            offset = np.array([-abs(rng.uniform(*self.offset)), rng.uniform(*self.offset)])
+            distance = float(np.linalg.norm(offset)) / np.cos(elevation)
+            return _Place(elevation, float(np.arctan2(-offset[1], -offset[0])), distance)
+        palms = [robot.palm(robot.home, g)[0] for g in range(len(robot.groups))]
+        others = np.mean(palms[:group] + palms[group + 1 :], axis=0) - palms[group]
+        heading = float(np.arctan2(others[1], others[0])) + rng.uniform(*self.facing)
+        return _Place(elevation, heading, self.advance * rng.random())
+
     def _first_touch(
         self,
         scene: Scene,
         probe_in: Callable[[Scene], Probe],
         q: np.ndarray,
         fixed: list[int],
-        place: _Place,
+        places: list[_Place],
     ) -> tuple[Scene, Grasp] | _Rejected:
-        """Scene and grasp of the first touch that begins with the hand at `place`, or why none."""
+        """Scene and grasp of the first touch that begins with palms at `places`, or why none."""
         no = _Rejected(Miss.NO_TOUCH, "no fingertip gets ahead of the palm")
-        for _ in range(MAX_PLACES):
+        robot, places = scene.articulated, list(places)
+        for _ in range(MAX_PLACES * len(places)):
             while True:
-                if place.distance <= 0.0:
+                if min(place.distance for place in places) <= 0.0:
                     return no
-                reached = _placed(scene, q, fixed, place)
+                reached = _placed(scene, q, fixed, places)
                 if reached is None:
                     return _Rejected(ARM, ARM)
                 placed, q = reached  # the next posture is near this one
@@ -153,7 +166,8 @@ class Start:
                 no = _Rejected(felt.reason, f"{felt.reason.value} ({felt.where})")
                 if felt.reason is not Miss.NO_TOUCH:
                     return no
-                place = replace(place, distance=place.distance - self.advance)
+                g = robot.group_of(felt.where)
+                places[g] = replace(places[g], distance=places[g].distance - self.advance)
             if felt.other_links:
                 return _Rejected(Miss.OTHER_LINK, f"{felt.other_links[0]} touches the object")
             vertical = felt.normals[:, 2]
@@ -161,8 +175,10 @@ class Start:
             if abs(vertical[worst]) <= scene.object.steepest:
                 return placed, felt
             no = _Rejected(EDGE, f"{felt.contacts[worst].name} {EDGE}")
-            back = place.distance + BACK * self.advance
-            place = replace(_nearer_the_middle(placed, felt, worst, place), distance=back)
+            g = robot.group_of(felt.contacts[worst].name)
+            back = places[g].distance + BACK * self.advance
+            nearer = _nearer_the_middle(placed, felt, worst, g, places[g])
+            places[g] = replace(nearer, distance=back)
         return no
 
 
@@ -207,26 +223,32 @@ class _Place:
         return np.column_stack([c * x + s * y, c * y - s * x, z])
 
 
-def _nearer_the_middle(scene: Scene, felt: Grasp, finger: int, place: _Place) -> _Place:
+def _nearer_the_middle(
+    scene: Scene, felt: Grasp, finger: int, group: int, place: _Place
+) -> _Place:
     """A little lower or higher, and turned, so that a finger leaves the end that it met."""
     robot = scene.articulated
-    lever = robot.centers(felt.q)[finger] - robot.palm(felt.q)[0]
+    lever = robot.centers(felt.q)[finger] - robot.palm(felt.q, group)[0]
     z = place.approach
     rises = np.sign(z[0] * lever[1] - z[1] * lever[0])  # when the palm turns about z
     end = np.sign(felt.normals[finger, 2])  # 1: the upper one
     return replace(place, height=place.height - end * SHIFT, turn=place.turn - end * rises * TURN)
 
 
-def _open_hand(robot: Robot, adduction: float) -> tuple[np.ndarray, list[int]] | None:
-    """The home posture with fingers open and spread as drawn, and the joints of the hand.
+def _open_hand(
+    robot: Robot, adductions: Sequence[float]
+) -> tuple[np.ndarray, list[int]] | None:
+    """The home posture with fingers open and spread as drawn, and the joints of the hands.
 
-    None where the hand cannot spread so far.
+    None where a hand cannot spread so far.
     """
     q = np.clip(robot.home, robot.q_lower, robot.q_upper)
     fixed = [j for joints in robot.flexion for j in joints]
     q = robot.opened(q)
-    if robot.description.adduction is not None:
-        spread = robot.index(robot.description.adduction)
+    for group, adduction in zip(robot.groups, adductions, strict=True):
+        spread = group.adduction
+        if spread is None:
+            continue
         if not robot.q_lower[spread] <= adduction <= robot.q_upper[spread]:
             return None
         q[spread] = adduction
@@ -234,13 +256,13 @@ def _open_hand(robot: Robot, adduction: float) -> tuple[np.ndarray, list[int]] |
     return q, fixed
 
 
-def _reach(robot: Robot, q: np.ndarray) -> float:
-    """How far before the palm every fingertip can get while it closes from q (n,) [m]."""
-    p_palm, R_palm = robot.palm(q)
-    farthest = np.full(len(robot.flexion), -np.inf)
+def _reach(robot: Robot, q: np.ndarray, group: int) -> float:
+    """How far before its palm every fingertip can get while it closes from q (n,) [m]."""
+    (p_palm, R_palm), own = robot.palm(q, group), list(robot.groups[group].points)
+    farthest = np.full(len(own), -np.inf)
     for share in np.linspace(0.0, 1.0, CLOSINGS):
         closed = robot.opened(q, share)
-        ahead = (robot.centers(closed) - p_palm) @ R_palm[:, 2] + robot.tip_radius
+        ahead = ((robot.centers(closed) - p_palm) @ R_palm[:, 2] + robot.tip_radius)[own]
         farthest = np.maximum(farthest, ahead)
     return float(farthest.min())
 
@@ -253,15 +275,21 @@ def _extent(scene: Scene) -> float:
 
 
 def _placed(
-    scene: Scene, q: np.ndarray, fixed: list[int], place: _Place
+    scene: Scene, q: np.ndarray, fixed: list[int], places: Sequence[_Place]
 ) -> tuple[Scene, np.ndarray] | None:
-    """Joints, from q on, that bring the palm to its place; None where no step is shown to."""
+    """Joints, from q on, that bring the palms to their places; None where no step is shown to."""
     robot = scene.articulated
-    p_palm = place.position(np.array(scene.position))
-    R_palm = place.rotation(robot.palm(robot.home)[1])
-    if not robot.arm:
-        p_now, R_now = robot.palm(q)
-        turn = R_palm @ R_now.T
-        return scene.rebased(p_palm - turn @ p_now, turn), q
-    found = reach(robot, q, p_palm, R_palm, fixed)
-    return None if found is None else (scene, found)
+    for g, place in enumerate(places):
+        p_palm = place.position(np.array(scene.position))
+        R_palm = place.rotation(robot.palm(robot.home, g)[1])
+        if not robot.arm:
+            p_now, R_now = robot.palm(q)
+            turn = R_palm @ R_now.T
+            return scene.rebased(p_palm - turn @ p_now, turn), q
+        others = [j for j in range(robot.n) if j not in robot.groups[g].arm]
+        keep = fixed if len(places) == 1 else others
+        found = reach(robot, q, p_palm, R_palm, keep, group=g)
+        if found is None:
+            return None
+        q = found
+    return scene, q

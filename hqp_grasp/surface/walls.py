@@ -8,7 +8,7 @@ import numpy as np
 
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.surface.felt import LEANING, SAME_NORMAL, SLACK, Felt
-from hqp_grasp.surface.outline import Outline, directions
+from hqp_grasp.surface.outline import FLATTEST, Outline, directions
 
 DISTINCT = 10  # ways, at most
 APART = 0.01  # [m] a contact's place differs by, between two ways
@@ -73,36 +73,44 @@ class Walls:
         s = self.outline.locate(grasp.centers @ self.outline.frame.T)
         cost, places = self.outline.balanced(s)
         end = np.abs(grasp.normals @ self.axis) > LEANING
-        height = self._height(grasp, end)
+        own, between = self._heights(grasp, end)
         ways: list[WayAround] = []
         left = np.ones(len(cost), dtype=bool)
         while left.any() and len(ways) < DISTINCT:
             i = int(np.argmin(np.where(left, cost, np.inf)))
             left &= np.abs(places - places[i]).max(axis=1) > APART
+            n = directions(self.outline.at(places[i])[0]).T
+            height = np.clip(own - np.linalg.pinv(n, rcond=FLATTEST) @ (n @ own), *between)
             ways.append(WayAround(self, grasp, s, places[i], height, end, float(cost[i])))
         return ways
 
-    def _height(self, grasp: Grasp, end: np.ndarray) -> float:
-        """Where along the axis all contacts should be [m]: three forces balance in one plane only.
+    def _heights(self, grasp: Grasp, end: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
+        """Where along the axis contacts would be by themselves (k,), and may be [m].
 
-        It is their mean; a contact whose normal leans would first move to the height of its ball's
-        middle. End faces that were felt keep their distance.
+        That is where they are; one whose normal leans would first move to the height of its ball's
+        middle. From there heights z_i change by the least that makes Σ z_i n_i vanish, as the
+        moment of forces across the axis does: two or three forces balance at one height only, of
+        more there is a choice. End faces that were felt keep their distance.
         """
         x, lean = self.felt.positions @ self.axis, self.felt.normals @ self.axis
         middle = x - self.felt.radii * lean
         side = np.abs(lean) < LEANING
+        own = middle[-grasp.k :]  # the newest points are this grasp's
         if not end.all():
-            z = float(middle[-grasp.k :][~end].mean())  # the newest points are this grasp's
+            mean = own[~end].mean()
         else:
-            z = float(middle[side].mean() if side.any() else x.mean())
+            mean = middle[side].mean() if side.any() else x.mean()
+        own = np.where(end, mean, own)
         top = x[lean > LEANING].min(initial=np.inf) - ROOM
         bottom = x[lean < -LEANING].max(initial=-np.inf) + ROOM
-        return min(max(z, bottom), top) if bottom < top else 0.5 * (bottom + top)
+        if bottom > top:
+            bottom = top = 0.5 * (bottom + top)
+        return own, (float(bottom), float(top))
 
 
 @dataclass(frozen=True, eq=False)
 class WayAround:
-    """Along the outline, where the normal turns as the outline does, and to one height.
+    """Along the outline, where the normal turns as the outline does, and to other heights.
 
     From an end face the way leads out beside the object, then along the axis.
     """
@@ -111,7 +119,7 @@ class WayAround:
     grasp: Grasp
     s: np.ndarray  # (k,) [m] where on the outline contacts are
     places: np.ndarray  # (k,) [m] where they should be
-    height: float  # [m] along the axis, of all of them
+    height: np.ndarray  # (k,) [m] along the axis, where they should be
     end: np.ndarray  # (k,) which contacts are on an end face or its rim, off the outline
     cost: float  # [m²]
 
@@ -134,7 +142,7 @@ class WayAround:
         if self.end.any():
             t, x = outline.at(self.places)
             side = directions(t) @ E
-            straight = x @ E + rho * side + self.height * a - c
+            straight = x @ E + rho * side + np.outer(self.height, a) - c
             sink = np.outer(straight @ a, a)
             beside = straight - sink
             out = np.linalg.norm(beside, axis=1)[:, None]

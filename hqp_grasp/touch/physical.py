@@ -381,7 +381,7 @@ def _silent(readings: Readings) -> np.ndarray:
 def _own_links(robot: Robot) -> tuple[tuple[int, list[int]], ...]:
     """Each tip's geom, and those of the robot that it can meet: all but its own finger's links."""
     model = robot.model
-    tips, arm = [geoms[0] for geoms in robot.geoms], robot.palm_body
+    tips, arm = [geoms[0] for geoms in robot.geoms], robot.groups[0].palm_body
     moving = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] != 0]
     touching = [g for g in moving if model.geom_contype[g] or model.geom_conaffinity[g]]
     found = []

@@ -33,13 +33,14 @@ CARRIAGE_PITCH = np.radians(40.0)  # of the approach axis below the horizontal, 
 CARRIAGE_RANGES = ((-2.0, 2.0),) * 3 + ((-2.6, 2.6), (-1.4, 1.4), (-2.6, 2.6))  # [m], [rad]
 FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 SIZES = {FREE: 7, BALL: 4}  # numbers that place a joint; others take one
-START = ("adduction", "elevation", "offset", "advance", "joints")  # of the drawn first postures
+START = ("adduction", "elevation", "offset", "facing", "advance", "joints")  # of the drawn first postures
 KEYS = {  # of each table; a key that is none of these is refused
     "file": (
         *("file", "root", "prefix", "at", "pos", "quat", "rpy"),
         *("degrees", "balanceinertia", "fusestatic", "package_root"),
     ),
-    "hand": ("name", "palm", "arm", "adduction", "contact_points"),
+    "group": ("name", "palm", "arm", "adduction", "contact_points"),
+    "hand": ("groups", "start"),
     "palm": ("body", "pos", "approach", "opposition"),
     "contact point": (
         *("name", "link", "geom", "geoms", "ball", "site", "flexion"),
@@ -51,8 +52,8 @@ KEYS = {  # of each table; a key that is none of these is refused
 }
 TOP = (
     *("model", "root", "description", "home", "speed", "velocity", "lock", "couplings"),
-    *("drop_couplings", "ranges", "carriage", "workspace", "clearance", "start", "hands"),
-    *KEYS["hand"][1:],
+    *("drop_couplings", "ranges", "carriage", "workspace", "clearance", "start"),
+    *("groups", "hands", *KEYS["group"][1:]),
 )
 
 
@@ -248,6 +249,7 @@ class ContactPoint:
     site: str = ""  # at the centre of the one geom, a sphere
     ball: tuple[float, ...] | None = None  # (4,) [m] centre in the link's frame, and radius
     closing: Mapping[str, float] | None = None  # signed weight of each joint that closes it
+    by_arm: bool = False  # the arm closes it, along the palm's approach axis
     force: str = ""  # sensors
     torque: str = ""
 
@@ -258,14 +260,23 @@ class ContactPoint:
 
 
 @dataclass(frozen=True)
-class Hand:
-    """What grasps: contact points that oppose one another, on a palm that an arm carries."""
+class Group:
+    """Contact points on a palm that an arm carries, such as a hand's fingertips."""
 
     name: str
     contact_points: tuple[ContactPoint, ...]
     palm: Palm | None = None
     arm: tuple[str, ...] | None = None  # joints that carry the palm
     adduction: str | None = None  # joint that spreads the fingers
+
+
+@dataclass(frozen=True)
+class Hand:
+    """What grasps together: one group, or several, each on an arm of its own."""
+
+    name: str
+    groups: tuple[str, ...]
+    start: Mapping[str, Any] = field(default_factory=dict)  # ranges of a Start
 
 
 @dataclass(frozen=True)
@@ -284,7 +295,8 @@ class RobotDescription:
 
     name: str
     files: tuple[ModelFile, ...]
-    hands: tuple[Hand, ...]
+    groups: tuple[Group, ...]
+    hands: tuple[Hand, ...] = ()  # each group by its own name, and what `hands` adds
     hand_name: str = ""  # the one that grasps; "": the first
     home: Mapping[str, float] = field(default_factory=dict)  # [rad], of a table or a keyframe
     bases: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -328,10 +340,21 @@ class RobotDescription:
             about = replace(about, hand_name=hand)
         return about
 
+    def __post_init__(self) -> None:
+        if not self.hands:
+            hands = tuple(Hand(group.name, (group.name,)) for group in self.groups)
+            object.__setattr__(self, "hands", hands)
+
     @property
     def hand(self) -> Hand:
         """The hand that grasps."""
         return next((h for h in self.hands if h.name == self.hand_name), self.hands[0])
+
+    @property
+    def grasping(self) -> tuple[Group, ...]:
+        """The groups of the hand that grasps."""
+        groups = {group.name: group for group in self.groups}
+        return tuple(groups[name] for name in self.hand.groups)
 
     @property
     def xml(self) -> Path:
@@ -340,21 +363,8 @@ class RobotDescription:
 
     @property
     def contact_points(self) -> tuple[ContactPoint, ...]:
-        return self.hand.contact_points
-
-    @property
-    def arm(self) -> tuple[str, ...]:
-        return self.hand.arm or ()
-
-    @property
-    def adduction(self) -> str | None:
-        return self.hand.adduction
-
-    @property
-    def palm(self) -> str:
-        """Site of the hand's palm in `spec()`."""
-        palm = self.hand.palm
-        return palm.site if palm is not None and palm.site else f"palm of {self.hand.name}"
+        """Those of all groups that grasp, group by group."""
+        return tuple(point for group in self.grasping for point in group.contact_points)
 
     def spec(self) -> mujoco.MjSpec:
         """The described model, ready to be composed with others."""
@@ -437,7 +447,7 @@ class RobotDescription:
 
     def _put_on_carriage(self, spec: mujoco.MjSpec) -> None:
         """Six joints at the root: at zero the palm is held as a drawn start holds it."""
-        palm, roots = self.hand.palm, spec.worldbody.bodies
+        palm, roots = self.grasping[0].palm, spec.worldbody.bodies
         if palm is None:
             raise ModelError(f"{self.name}: a carriage needs a palm to hold the hand by")
         if len(roots) != 1 or spec.worldbody.geoms:
@@ -464,13 +474,13 @@ class RobotDescription:
         mujoco.mj_kinematics(model, data)
         z = np.array([np.cos(CARRIAGE_PITCH), 0.0, -np.sin(CARRIAGE_PITCH)])
         y = np.array([0.0, 1.0, 0.0])
-        R_palm = data.site(self.palm).xmat.reshape(3, 3)
+        R_palm = data.site(palm_site(self.grasping[0])).xmat.reshape(3, 3)
         turn = np.column_stack([y, np.cross(z, y), z]) @ R_palm.T
         root = model.body(roots[0].name).id
         R_root = turn @ data.xmat[root].reshape(3, 3)
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, R_root.ravel())
-        to_palm = turn @ (data.site(self.palm).xpos - data.xpos[root])
+        to_palm = turn @ (data.site(palm_site(self.grasping[0])).xpos - data.xpos[root])
         _place(spec, roots[0], -to_palm, quat)
         axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
         for name, axis, ends in zip(CARRIAGE, axes, CARRIAGE_RANGES, strict=True):
@@ -526,29 +536,29 @@ class RobotDescription:
             for i, geom in enumerate(body.geoms):
                 if not geom.name and (geom.contype or geom.conaffinity):
                     geom.name = f"{body.name}:{i}"
-        points = [point for hand in self.hands for point in hand.contact_points]
+        points = self.contact_points
         spheres = {geom.name for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE}
         if not all(p.ball or (p.site and p.geoms and spheres.issuperset(p.geoms)) for p in points):
             spec.option.ccd_tolerance, spec.option.ccd_iterations = CCD_TOLERANCE, CCD_ITERATIONS
         bodies = {body.name: body for body in spec.bodies}
-        for hand in self.hands:
-            palm = hand.palm
+        for group in self.groups:
+            palm = group.palm
             if palm is not None and palm.body:
                 _known("body", palm.body, bodies, f"palm of {self.name}")
                 x, z = _axes(palm)
                 quat = np.zeros(4)
                 mujoco.mju_mat2Quat(quat, np.column_stack([x, np.cross(z, x), z]).ravel())
-                bodies[palm.body].add_site(name=f"palm of {hand.name}", pos=palm.pos, quat=quat)
-            for point in hand.contact_points:
-                if point.ball is not None:
-                    _known("body", point.link, bodies, f"contact point {point.name} of {self.name}")
-                    bodies[point.link].add_geom(
-                        name=ball_name(point),
-                        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                        pos=point.ball[:3],
-                        size=[point.ball[3], 0.0, 0.0],
-                        mass=0.0,
-                    )
+                bodies[palm.body].add_site(name=palm_site(group), pos=palm.pos, quat=quat)
+        for point in points:
+            if point.ball is not None:
+                _known("body", point.link, bodies, f"contact point {point.name} of {self.name}")
+                bodies[point.link].add_geom(
+                    name=ball_name(point),
+                    type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                    pos=point.ball[:3],
+                    size=[point.ball[3], 0.0, 0.0],
+                    mass=0.0,
+                )
 
     def _drops(self, equality: mujoco.MjsEquality) -> bool:
         if isinstance(self.drop_couplings, bool):
@@ -607,6 +617,12 @@ def _limited(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> bool:
 def _angle_unit(spec: mujoco.MjSpec) -> float:
     """What 1 in the angles of a model file is [rad]."""
     return float(np.pi / 180.0) if spec.compiler.degree else 1.0
+
+
+def palm_site(group: Group) -> str:
+    """The site of a group's palm in the described model."""
+    palm = group.palm
+    return palm.site if palm is not None and palm.site else f"palm of {group.name}"
 
 
 def ball_name(point: ContactPoint) -> str:
@@ -670,18 +686,20 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         if not isinstance(model, str):
             raise InputError("root belongs into [[model]], beside the file whose body it names")
         parts = [{"file": model, "root": data["root"]}]
-    if "hands" in data:
-        mixed = [key for key in KEYS["hand"] if key in data]
+    if isinstance(data.get("hands"), list):
+        raise InputError("hands names groups, hands = { both = [...] }; a group is [[groups]]")
+    if "groups" in data:
+        mixed = [key for key in KEYS["group"] if key in data]
         if mixed:
-            raise InputError(f"{mixed[0]} belongs into [[hands]], as there are hands")
-        hands = tuple(_hand(h) for h in data["hands"])
+            raise InputError(f"{mixed[0]} belongs into [[groups]], as there are groups")
+        groups = tuple(_group(group) for group in data["groups"])
     else:
-        hands = (_hand({"name": "hand", **{k: data[k] for k in KEYS["hand"] if k in data}}),)
-    if not hands:
-        raise InputError("hands is empty")
-    _refuse_twice("hands", [hand.name for hand in hands])
-    points = [point for hand in hands for point in hand.contact_points]
-    _refuse_twice("contact points with a ball", [p.name for p in points if p.ball is not None])
+        own = {key: data[key] for key in KEYS["group"] if key in data}
+        groups = (_group({"name": "hand", **own}),)
+    if not groups:
+        raise InputError("groups is empty")
+    _refuse_twice("groups", [group.name for group in groups])
+    hands = _hands(groups, _table("hands", data, "hands"))
     files = tuple(_file(part, folder) for part in parts)
     named, bases = data.get("home"), dict[str, tuple[float, ...]]()
     if named is None or isinstance(named, str):
@@ -694,6 +712,7 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
     return RobotDescription(
         name=folder.resolve().name if path.name == "robot.toml" else path.stem,
         files=files,
+        groups=groups,
         hands=hands,
         home=home,
         bases=bases,
@@ -761,21 +780,42 @@ def _refuse_twice(what: str, names: list[str]) -> None:
         raise InputError(f"two {what} are named {twice!r}")
 
 
-def _hand(data: object) -> Hand:
+def _group(data: object) -> Group:
     if not isinstance(data, dict):
-        raise InputError(f"hands must be tables; got {data!r}")
-    _check(data, KEYS["hand"], "hands")
+        raise InputError(f"groups must be tables; got {data!r}")
+    _check(data, KEYS["group"], "groups")
+    name = _text(data["name"])
     points = tuple(_contact_point(p) for p in data["contact_points"])
     if not points:
-        raise InputError("contact_points is empty")
-    _refuse_twice("contact points", [point.name for point in points])
-    return Hand(
-        _text(data["name"]),
+        raise InputError(f"contact_points of {name} is empty: a group touches with one at least")
+    return Group(
+        name,
         points,
         _palm(data["palm"]) if "palm" in data else None,
         _texts(data["arm"]) if "arm" in data else None,
         _text(data["adduction"]) if "adduction" in data else None,
     )
+
+
+def _hands(groups: Sequence[Group], table: Mapping[str, object]) -> tuple[Hand, ...]:
+    """Each group by itself, and the hands of several that the table adds."""
+    by_name = {group.name: group for group in groups}
+    hands = [Hand(name, (name,)) for name in by_name]
+    for name, value in table.items():
+        about: Any = value if isinstance(value, dict) else {"groups": value}
+        _check(about, KEYS["hand"], f"hands.{name}")
+        together = tuple(
+            _known("group", group, by_name, f"hands.{name}") for group in _texts(about["groups"])
+        )
+        if not together:
+            raise InputError(f"hands.{name} is empty: it names the groups that grasp together")
+        _refuse_twice(f"groups of hands.{name}", list(together))
+        hands.append(Hand(name, together, _start(about.get("start", {}))))
+    _refuse_twice("hands", [hand.name for hand in hands])
+    for hand in hands:
+        points = [point for name in hand.groups for point in by_name[name].contact_points]
+        _refuse_twice(f"contact points of hand {hand.name!r}", [point.name for point in points])
+    return tuple(hands)
 
 
 def _palm(data: object) -> Palm:
@@ -811,8 +851,11 @@ def _contact_point(data: object) -> ContactPoint:
         centre = _vector("ball.pos", ball.get("pos", [0.0] * 3))
         ball = (*centre, positive("ball.radius", ball["radius"]))
     flexion = data.get("flexion")
-    if isinstance(flexion, dict):
-        closing: Mapping[str, float] | None = {
+    by_arm = flexion == "arm"
+    if by_arm:
+        closing: Mapping[str, float] | None = {}
+    elif isinstance(flexion, dict):
+        closing = {
             joint: _number(f"flexion of {joint}", weight) for joint, weight in flexion.items()
         }
     else:
@@ -828,6 +871,7 @@ def _contact_point(data: object) -> ContactPoint:
         _text(data.get("site", "")),
         ball,
         closing,
+        by_arm,
         _text(data.get("force", "")),
         _text(data.get("torque", "")),
     )
@@ -902,10 +946,10 @@ def _texts(value: object) -> tuple[str, ...]:
     return tuple(_text(v) for v in value)
 
 
-def _table(name: str, data: Mapping[str, Any]) -> Mapping[str, object]:
+def _table(name: str, data: Mapping[str, Any], of: str = "joints") -> Mapping[str, object]:
     table = data.get(name, {})
     if not isinstance(table, dict):
-        raise InputError(f"{name} must be a table of joints; got {table!r}")
+        raise InputError(f"{name} must be a table of {of}; got {table!r}")
     return table
 
 

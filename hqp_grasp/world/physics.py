@@ -233,7 +233,7 @@ def _add_palm_sensors(spec: mujoco.MjSpec, robot: Robot) -> None:
             objtype=mujoco.mjtObj.mjOBJ_BODY,
             objname=OBJECT,
             reftype=mujoco.mjtObj.mjOBJ_XBODY,
-            refname=robot.model.body(robot.palm_body).name,
+            refname=robot.model.body(robot.groups[0].palm_body).name,
         )
 
 

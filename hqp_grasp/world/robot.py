@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 
 import mujoco
@@ -18,10 +19,12 @@ from hqp_grasp.world.description import (
     SLIDE_SPEED,
     SPEED,
     ContactPoint,
+    Group,
     Palm,
     RobotDescription,
     ball_name,
     nearest,
+    palm_site,
 )
 
 SPHERE, CAPSULE = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
@@ -54,6 +57,19 @@ MEASURES = {  # of a compiled model, which MuJoCo takes as they are, numbers or 
 }
 
 
+@dataclass(frozen=True, eq=False)
+class RobotGroup:
+    """A palm, what carries it, and the contact points on it."""
+
+    name: str
+    points: tuple[int, ...]  # of the robot's contact points
+    arm: tuple[int, ...]  # joints that carry the palm, into q
+    adduction: int | None  # joint that spreads the fingers, into q
+    palm_body: int
+    p_palm: np.ndarray  # (3,) [m] in that body's frame
+    R_palm: np.ndarray  # (3, 3) z approach axis, x opposition axis, in that body's frame
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """A described robot inside a compiled MuJoCo model.
@@ -76,7 +92,8 @@ class Robot:
     home: np.ndarray = field(init=False)  # (n,) [rad]
     flexion: tuple[tuple[int, ...], ...] = field(init=False)  # for each contact point, into q
     closing: np.ndarray = field(init=False)  # (k, n) [rad] how q moves as a point closes, signed
-    arm: tuple[int, ...] = field(init=False)  # joints that carry the palm, into q
+    groups: tuple[RobotGroup, ...] = field(init=False)  # whose contact points touch, in turn
+    arm: tuple[int, ...] = field(init=False)  # joints that carry a palm, into q
     idle: np.ndarray = field(init=False)  # (n,) bool: moves no contact point, as the other arm's
     geoms: tuple[tuple[int, ...], ...] = field(init=False)  # that touch, for each contact point
     tip_radius: np.ndarray = field(init=False)  # (k,) [m] of a round tip, 0 for other shapes
@@ -84,7 +101,6 @@ class Robot:
     _points: np.ndarray = field(init=False, repr=False)  # (k, 3) [m] centres, link frames
     _bodies: np.ndarray = field(init=False, repr=False)  # (k,) links
     _balls: np.ndarray | None = field(init=False, repr=False)  # (k,) geoms where all are balls
-    _palm: tuple[int, np.ndarray, np.ndarray] = field(init=False, repr=False)  # body, p, R
     _hinge: np.ndarray = field(init=False, repr=False)  # (N,) bool
     _ancestor: np.ndarray = field(init=False, repr=False)  # (k, N) bool: joint j moves point i
     _nearer_base: np.ndarray = field(init=False, repr=False)  # (N, N) bool: j at or above l
@@ -139,16 +155,9 @@ class Robot:
         put("reach", np.array([_reach(model, v) for v in links]) @ np.abs(C))
         put("closing", self._closing(independent, moves))
         put("flexion", tuple(tuple(np.flatnonzero(w).tolist()) for w in self.closing))
-        put("_palm", self._find_palm())
-        fingers = {j for joints in self.flexion for j in joints}
-        if about.hand.arm is None:
-            carries = np.abs(C[_chain(model, self._palm[0])]).sum(axis=0) > 0.0
-            arm = tuple(j for j in range(self.n) if carries[j] and j not in fingers)
-        else:
-            arm = tuple(self.index(joint) for joint in about.arm)
-        put("arm", arm)
-        if about.adduction is not None:
-            self.index(about.adduction)
+        self._refuse_coupled(chains)
+        put("groups", tuple(self._groups()))
+        put("arm", tuple(sorted({j for group in self.groups for j in group.arm})))
 
     def _refuse_stuck(self, names: Sequence[str]) -> None:
         """Raise where couplings leave a joint no range, or a single angle."""
@@ -231,12 +240,13 @@ class Robot:
     def _guessed_closing(self, i: int, independent: list[int], moves: np.ndarray) -> np.ndarray:
         """The joints that bend a finger: the last one, and those parallel to it."""
         point = self.description.contact_points[i]
+        spreading = [group.adduction for group in self.description.grasping]
         own = [
             j
             for j in range(self.n)
             if moves[i, j]
             and moves[:, j].sum() == 1
-            and self.joints[j] != self.description.adduction
+            and self.joints[j] not in spreading
         ]
         if not own:
             raise ModelError(
@@ -288,25 +298,53 @@ class Robot:
             less = back[-1] - there[-1]
         return float(np.sign(less)) if abs(less) >= CENTRED else wider
 
-    def _find_palm(self) -> tuple[int, np.ndarray, np.ndarray]:
+    def _groups(self) -> Iterator[RobotGroup]:
+        """What the description says of its groups, in numbers, the arms found where it is silent."""
+        about, first = self.description, 0
+        fingers = {j for joints in self.flexion for j in joints}
+        carrying: dict[int, str] = {}
+        for group in about.grasping:
+            points = tuple(range(first, first + len(group.contact_points)))
+            first = points[-1] + 1
+            body, p, R = self._palm_of(group, points)
+            if group.arm is None:
+                carries = np.abs(self.coupling[_chain(self.model, body)]).sum(axis=0) > 0.0
+                arm = tuple(j for j in range(self.n) if carries[j] and j not in fingers)
+            else:
+                arm = tuple(self.index(joint) for joint in group.arm)
+            for j in arm:
+                other = carrying.setdefault(j, group.name)
+                if other != group.name:
+                    raise ModelError(
+                        f"groups {other!r} and {group.name!r} of {about.name} share the arm joint "
+                        f"{self.joints[j]!r}: groups that grasp together have an arm each, "
+                        "arm = [...] says which joints"
+                    )
+            if not arm and any(about.contact_points[i].by_arm for i in points):
+                raise ModelError(f"group {group.name!r} of {about.name} has no arm to close with")
+            adduction = None if group.adduction is None else self.index(group.adduction)
+            yield RobotGroup(group.name, points, arm, adduction, body, p, R)
+
+    def _palm_of(
+        self, group: Group, points: tuple[int, ...]
+    ) -> tuple[int, np.ndarray, np.ndarray]:
         """Body of the palm, and where on it p (3,), R (3, 3): z approach axis, x opposition."""
-        model, hand = self.model, self.description.hand
-        if hand.palm is not None:
-            site = _id(
-                model, mujoco.mjtObj.mjOBJ_SITE, self.description.palm, "site", self.description
-            )
+        model, own = self.model, list(points)
+        if group.palm is not None:
+            site = _id(model, mujoco.mjtObj.mjOBJ_SITE, palm_site(group), "site", self.description)
             R = np.zeros(9)
             mujoco.mju_quat2Mat(R, model.site_quat[site])
             return int(model.site_bodyid[site]), model.site_pos[site].copy(), R.reshape(3, 3)
-        above = [_ancestors(model, body) for body in self._bodies]
+        above = [_ancestors(model, body) for body in self._bodies[own]]
         body = next(b for b in above[0] if all(b in others for others in above))
-        room = np.clip(self.closing.sum(axis=0), self.q_lower - self.home, self.q_upper - self.home)
+        closing = self.closing[own]
+        room = np.clip(closing.sum(axis=0), self.q_lower - self.home, self.q_upper - self.home)
         half = self.home + 0.5 * room
         v = np.einsum(
-            "kaj,kj->ka", self.jacobian(half).reshape(len(above), 3, self.n), self.closing
+            "kaj,kj->ka", self.jacobian(half).reshape(-1, 3, self.n)[own], closing
         )
         data = self._at(half)
-        z = self.centers(half).mean(axis=0) - data.xpos[body]
+        z = self.centers(half)[own].mean(axis=0) - data.xpos[body]
         if np.linalg.norm(z) < CENTRED:
             z = np.linalg.eigh(v.T @ v)[1][:, 0]
         z = z / np.linalg.norm(z)
@@ -316,6 +354,23 @@ class Robot:
         x /= np.linalg.norm(x)
         R = data.xmat[body].reshape(3, 3).T @ np.column_stack([x, np.cross(z, x), z])
         return body, np.zeros(3), R
+
+    def _refuse_coupled(self, chains: Sequence[Sequence[int]]) -> None:
+        """Raise where one independent joint moves joints of two groups that share no link."""
+        about, first, moved = self.description, 0, list[set[int]]()
+        for group in about.grasping:
+            last = first + len(group.contact_points)
+            moved.append({j for chain in chains[first:last] for j in chain})
+            first = last
+        for (one, a), (other, b) in combinations(zip(about.grasping, moved, strict=True), 2):
+            for j in range(self.n):
+                driven = set(np.flatnonzero(self.coupling[:, j]).tolist())
+                if driven & (a - b) and driven & (b - a):
+                    raise ModelError(
+                        f"joint {self.joints[j]!r} of {about.name} moves groups {one.name!r} and "
+                        f"{other.name!r} by a coupling: groups move by themselves; drop_couplings "
+                        "frees them"
+                    )
 
     def __repr__(self) -> str:
         return f"Robot({self.description.name!r})"
@@ -448,27 +503,40 @@ class Robot:
         sites = [self.model.site(point.site).id for point in self.description.contact_points]
         return self._at(q).site_xmat[sites].reshape(-1, 3, 3)
 
-    @property
-    def palm_body(self) -> int:
-        """The link that is the palm."""
-        return self._palm[0]
-
-    def palm(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the palm is, p_palm (3,) [m] and R_world_palm (3, 3), world.
+    def palm(self, q: np.ndarray, group: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Where a group's palm is, p_palm (3,) [m] and R_world_palm (3, 3), world.
 
         Its z axis is the approach axis, its x axis the opposition axis.
         """
-        data, (body, p, R) = self._at(q), self._palm
-        R_world_body = data.xmat[body].reshape(3, 3)
-        return data.xpos[body] + R_world_body @ p, R_world_body @ R
+        data, palm = self._at(q), self.groups[group]
+        R_world_body = data.xmat[palm.palm_body].reshape(3, 3)
+        return data.xpos[palm.palm_body] + R_world_body @ palm.p_palm, R_world_body @ palm.R_palm
 
-    def palm_jacobian(self, q: np.ndarray) -> np.ndarray:
-        """The palm's velocity and angular velocity for each joint (6, n) [m/rad, –], world."""
+    def palm_jacobian(self, q: np.ndarray, group: int = 0) -> np.ndarray:
+        """A palm's velocity and angular velocity for each joint (6, n) [m/rad, –], world."""
         data = self._at(q)
         mujoco.mj_comPos(self.model, data)
         J = np.zeros((6, self.model.nv))
-        mujoco.mj_jac(self.model, data, J[:3], J[3:], self.palm(q)[0], self._palm[0])
+        p_palm, body = self.palm(q, group)[0], self.groups[group].palm_body
+        mujoco.mj_jac(self.model, data, J[:3], J[3:], p_palm, body)
         return J @ self.coupling
+
+    def group_of(self, where: str) -> int:
+        """The group of a contact point, or of a link or geom that one of the arms carries.
+
+        0 where it is none of these.
+        """
+        names = [point.name for point in self.description.contact_points]
+        if where in names:
+            i = names.index(where)
+            return next(g for g, group in enumerate(self.groups) if i in group.points)
+        model = self.model
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, where)
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, where)
+        body = int(model.geom_bodyid[geom]) if geom >= 0 else body
+        moving = self.coupling[_chain(model, max(body, 0))].any(axis=0)
+        share = [int(moving[list(group.arm)].sum()) for group in self.groups]
+        return int(np.argmax(share))
 
     def opened(self, q: np.ndarray, share: float = 0.0) -> np.ndarray:
         """q (n,) with every finger open, or closed by a share of all it can.
@@ -609,14 +677,15 @@ def _refuse_no_numbers(model: mujoco.MjModel, about: RobotDescription) -> None:
 def described(robot: str | Path, hand: str | None = None) -> RobotDescription:
     """A robot's description; where a carriage has no palm to hold it by, with the one found."""
     about = RobotDescription.load(robot, hand)
-    if about.carriage and about.hand.palm is None:
+    if about.carriage and about.grasping[0].palm is None:
         alone = replace(about, carriage=False)
         found = Robot(alone, compiled(alone))
-        body, p, R = found._palm
-        name = found.model.body(body).name
+        first = found.groups[0]
+        p, R = first.p_palm, first.R_palm
+        name = found.model.body(first.palm_body).name
         palm = Palm("", name, tuple(p.tolist()), tuple(R[:, 2].tolist()), tuple(R[:, 0].tolist()))
-        hands = [replace(h, palm=palm) if h is about.hand else h for h in about.hands]
-        about = replace(about, hands=tuple(hands))
+        groups = [replace(g, palm=palm) if g.name == first.name else g for g in about.groups]
+        about = replace(about, groups=tuple(groups))
     return about
 
 

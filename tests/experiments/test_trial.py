@@ -423,7 +423,7 @@ def tight(records, scene):
     for record in records.values():
         for grasp in record.grasps[:2]:
             limited = robot
-            for joint in robot.description.arm[:5]:
+            for joint in [robot.joints[j] for j in robot.arm[:5]]:
                 q = grasp.q[robot.index(joint)]
                 limited = narrowed(limited, joint, q - 2e-3, q + 2e-3)
             limits = StepLimit(), ConfigurationLimit(limited)

@@ -354,7 +354,7 @@ def test_either_hand_of_the_torso_grasps_and_the_other_is_idle():
     for name, other in (("right", "left"), ("left", "right")):
         robot = robot_of("umass_torso", hand=name)
         assert robot.n == 22 and robot.model.njnt == 30
-        assert robot.description.adduction == f"{name}_bhand_f1_spread"
+        assert robot.joints[robot.groups[0].adduction or 0] == f"{name}_bhand_f1_spread"
         idle = [joint for joint, still in zip(robot.joints, robot.idle, strict=True) if still]
         assert len(idle) == 11 and all(joint.startswith(other) for joint in idle)
     with pytest.raises(InputError, match=r"unknown hand of umass_torso 'third'.*right, left"):
@@ -702,7 +702,7 @@ def test_a_table_of_joints_must_be_one(tmp_path, line):
 
 
 def test_two_hands_of_one_name_are_refused(tmp_path):
-    hand = '[[hands]]\nname = "left"\ncontact_points = [{ link = "distal" }]\n'
+    hand = '[[groups]]\nname = "left"\ncontact_points = [{ link = "distal" }]\n'
     toml = 'model = "tiny.xml"\n' + hand + hand
     refused(lambda: written(tmp_path, NO_KEYS, toml), "two hands are named 'left'")
     hand = hand.replace('"distal" }', '"distal", name = "tip", ball = { radius = 0.01 } }')
