@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hqp_grasp.control.episode import BROKEN, Episode
+from hqp_grasp.control.episode import BROKEN, Episode, MissPolicy
 from hqp_grasp.control.forms import Form, form_of
 from hqp_grasp.control.landing import land
 from hqp_grasp.control.limits import (
@@ -19,7 +19,7 @@ from hqp_grasp.control.limits import (
 )
 from hqp_grasp.control.step import Plan
 from hqp_grasp.errors import HqpGraspError, InputError, flag, instance, whole
-from hqp_grasp.grasp import Grasp, Touch
+from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Priority, Stack, Task
 from hqp_grasp.world.robot import Robot
@@ -109,10 +109,10 @@ class Controller:
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
-        retreat, short = policy.withdrawal(misses), policy.shorter(misses)
+        short = policy.shorter(misses)
         stack: Stack = self.stack  # type: ignore[assignment]
-        if retreat > 0.0:
-            stack = stack.within(RetreatLimit(self.robot, retreat))
+        back = self._withdrawals(policy, misses)
+        stack = stack.within(*(RetreatLimit(self.robot, far, g) for g, far in back.items()))
         plan = form.plan(stack, episode)
         share = policy.shares[short]
         x = (1.0 if plan.exact else share) * plan.x
@@ -120,13 +120,29 @@ class Controller:
             x = land(self.robot, stack, grasp, x)
         reactions = {
             "from the first grasp again": episode.again,
-            f"palm back by {1e3 * retreat:g} mm": retreat > 0.0,
+            ", ".join(self._told(back)): back,
             f"{share:g} of the step": short,
             "the same again": misses and misses[-1].reason in BROKEN,
         }
         told = [what for what, done in reactions.items() if done]
         reason = ", ".join([*told, plan.reason] if plan.reason else told)
         return Step(self._clipped(grasp, x), episode.way, plan, share, reason)
+
+    def _withdrawals(self, policy: MissPolicy, misses: Sequence[Missed]) -> dict[int, float]:
+        """How far [m] groups withdraw, by group."""
+        of = [self.robot.group_of(missed.where) for missed in misses]
+        groups = range(len(self.robot.groups))
+        far = {
+            g: policy.withdrawal([m for m, group in zip(misses, of, strict=True) if group == g])
+            for g in groups
+        }
+        return {g: distance for g, distance in far.items() if distance > 0.0}
+
+    def _told(self, back: Mapping[int, float]) -> Iterator[str]:
+        groups = self.robot.groups
+        for g, distance in back.items():
+            palm = f"palm {groups[g].name}" if len(groups) > 1 else "palm"
+            yield f"{palm} back by {1e3 * distance:g} mm"
 
     def _search(self, q: np.ndarray, way: np.ndarray | None) -> Step:
         """The first touch, sent to q (n,) [rad], again, with the palm moved by `way` (3,) [m]."""

@@ -12,7 +12,7 @@ from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
 from hqp_grasp.surface.denoise import denoised
 from hqp_grasp.world.robot import Robot
 
-IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE)  # what the palm withdraws from
+IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE, Miss.INSIDE)  # what a palm withdraws from
 BROKEN = (Miss.SENSOR, Miss.STUCK)  # no fault of the step, and it may pass
 PASSING = (*BROKEN, Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR)  # what the first touch tries again
 
@@ -22,7 +22,8 @@ class MissPolicy:
     """What the hand does after misses.
 
     The step is taken again from the last grasp, shorter. Where another link than the contact points
-    met the object, or a tip the table, the palm withdraws on the next step. Where a sensor was
+    met the object, or an open finger was in it, or a tip met the table, the palm of that group
+    withdraws on the next step. Where a sensor was
     silent, or the hand did not open, the same step is tried again. When nothing is left to try, the
     hand begins again from its first grasp; where that brings no touch either, it gives up. Where
     the very first touch finds nothing, the palm is sent beside there, level, all around.
@@ -49,7 +50,7 @@ class MissPolicy:
         return sum(missed.reason not in IN_THE_WAY + BROKEN for missed in misses)
 
     def withdrawal(self, misses: Sequence[Missed]) -> float:
-        """How far [m] the palm withdraws, for the last misses that had something in the way."""
+        """How far [m] a palm withdraws, for the last misses of its group, if in the way."""
         return self.retreat * [*[m.reason in IN_THE_WAY for m in misses[::-1]], False].index(False)
 
     def direction(self, misses: Sequence[Missed]) -> np.ndarray | None:

@@ -124,10 +124,7 @@ class ClearanceLimit(Limit):
 
 @dataclass(frozen=True, eq=False)
 class RetreatLimit(Limit):
-    """A group's palm moves back along its approach axis by at least `distance` [m].
-
-    Below 0 it comes on.
-    """
+    """A group's palm moves back along its approach axis by at least `distance` [m]."""
 
     robot: Robot
     distance: float  # [m]
@@ -137,8 +134,6 @@ class RetreatLimit(Limit):
     def level(self, grasp: Grasp) -> Level:
         approach = self.robot.palm(grasp.q, self.group)[1][:, 2]
         A = approach @ self.robot.palm_jacobian(grasp.q, self.group)[:3]
-        if self.distance < 0.0:
-            return Level(A[None], np.array([-self.distance]), np.array([np.inf]), "advance")
         return Level(A[None], np.array([-np.inf]), np.array([-self.distance]), "retreat")
 
 

@@ -70,7 +70,7 @@ class Target:
         if not np.isfinite(away):
             return np.inf
         J = robot.carried(self.grasp, q)[1].reshape(self.grasp.k, 3, -1)
-        closing = np.einsum("kan,kn->ka", J, robot.closing)
+        closing = np.einsum("kan,kn->ka", J, robot.closing_at(q))
         into = -(closing * self.way.at(gain)[1]).sum(axis=1) / np.linalg.norm(closing, axis=1)
         excess = away / AWAY - 1.0, deep / DEEP, 1.0 - float(into.min()) / INTO
         return sum(max(part, 0.0) for part in excess)

@@ -223,9 +223,7 @@ class _Place:
         return np.column_stack([c * x + s * y, c * y - s * x, z])
 
 
-def _nearer_the_middle(
-    scene: Scene, felt: Grasp, finger: int, group: int, place: _Place
-) -> _Place:
+def _nearer_the_middle(scene: Scene, felt: Grasp, finger: int, group: int, place: _Place) -> _Place:
     """A little lower or higher, and turned, so that a finger leaves the end that it met."""
     robot = scene.articulated
     lever = robot.centers(felt.q)[finger] - robot.palm(felt.q, group)[0]
@@ -235,9 +233,7 @@ def _nearer_the_middle(
     return replace(place, height=place.height - end * SHIFT, turn=place.turn - end * rises * TURN)
 
 
-def _open_hand(
-    robot: Robot, adductions: Sequence[float]
-) -> tuple[np.ndarray, list[int]] | None:
+def _open_hand(robot: Robot, adductions: Sequence[float]) -> tuple[np.ndarray, list[int]] | None:
     """The home posture with fingers open and spread as drawn, and the joints of the hands.
 
     None where a hand cannot spread so far.

@@ -211,7 +211,7 @@ def summing_to_zero(theta: np.ndarray, place: np.ndarray) -> np.ndarray:
         across = np.column_stack([-n[:, 1], n[:, 0]])
         t = t - np.linalg.pinv(across.T, rcond=FLATTEST) @ n.sum(axis=0)
     t = t - t[first]
-    ordered = (np.diff(t[np.argsort(place)]) > 0.0).all()
+    ordered = (np.diff(t[np.argsort(place)]) > -SAME_ANGLE).all()  # those on one face are equal
     return t if ordered and np.abs(directions(t).sum(axis=0)).max() < SAME_ANGLE else equal
 
 

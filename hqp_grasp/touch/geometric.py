@@ -18,7 +18,8 @@ from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import CAPSULE, CYLINDER, SPHERE
 from hqp_grasp.world.scene import Scene
 
-RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves
+RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves,
+WITHDRAWAL = 0.03  # [m] and each palm that its arm closes goes back by this
 TOUCH = 1e-9  # [m] gap at which a ball touches
 # Two meshes at gap 0 have no direction between them: there a touch ends within these gaps.
 CLOSE = (1e-9, 1e-8)  # [m]
@@ -77,7 +78,7 @@ class GeometricProbe:
         one_of("links", self.links, ("pass", "block"))
         robot, model = self.scene.articulated, self.scene.model
         for point, way in zip(robot.description.contact_points, robot.closing, strict=True):
-            if not way.any():
+            if not way.any() and not point.by_arm:
                 raise InputError(f"{point.name} has no flexion joint, and so cannot close")
         put("_local", threading.local())
         put("_round", tuple(bool(radius > 0.0) for radius in robot.tip_radius))
@@ -114,7 +115,7 @@ class GeometricProbe:
                 return found
         if self._may_aim:
             q, closed = found
-            near = [i for i, s in enumerate(closed) if abs(s) <= RETREAT]
+            near = [i for i, s in enumerate(closed) if ways[i].any() and abs(s) <= RETREAT]
             aimed = self._aimed(q, ways, near)
             pressed = self._close(q_target, aimed)
             found = found if isinstance(pressed, Missed) else pressed
@@ -158,7 +159,9 @@ class GeometricProbe:
         """Open by RETREAT, then close every finger its way, q(s) = clip(q_target + s·way).
 
         `ways` (k, n) are signed; a finger's fastest joint moves by 1 rad while its s grows by 1.
-        Returns the posture that touches, q (n,) [rad], and s (k) [rad] there.
+        A palm that an arm closes has none: it comes first, fingers still open, straight along its
+        approach axis, by 1 m while its s grows by 1.
+        Returns the posture that touches, q (n,) [rad], and s (k) [rad, m] there.
         """
         robot = self.scene.articulated
         k, q = len(ways), q_target.copy()

@@ -33,7 +33,14 @@ CARRIAGE_PITCH = np.radians(40.0)  # of the approach axis below the horizontal, 
 CARRIAGE_RANGES = ((-2.0, 2.0),) * 3 + ((-2.6, 2.6), (-1.4, 1.4), (-2.6, 2.6))  # [m], [rad]
 FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 SIZES = {FREE: 7, BALL: 4}  # numbers that place a joint; others take one
-START = ("adduction", "elevation", "offset", "facing", "advance", "joints")  # of the drawn first postures
+START = (
+    "adduction",
+    "elevation",
+    "offset",
+    "facing",
+    "advance",
+    "joints",
+)  # of the drawn first postures
 KEYS = {  # of each table; a key that is none of these is refused
     "file": (
         *("file", "root", "prefix", "at", "pos", "quat", "rpy"),

@@ -45,6 +45,7 @@ LEAN = 0.5  # [rad] a range that goes no further on one side than this bends to 
 STEPS = 10  # places along 1 rad of closing in which the nearest is looked for
 UNLIMITED = 1.0  # [rad, m] a joint without range opens and closes by from where it is
 HELD = 1e-9  # [rad] rounding, of a joint that is held at the end of its range
+SINGULAR = 1e-3  # [–] of a palm's Jacobian, below which its arm cannot go there
 CENTRED = 1e-9  # [m] a contact point's site and its geom's centre agree to this
 
 
@@ -244,9 +245,7 @@ class Robot:
         own = [
             j
             for j in range(self.n)
-            if moves[i, j]
-            and moves[:, j].sum() == 1
-            and self.joints[j] not in spreading
+            if moves[i, j] and moves[:, j].sum() == 1 and self.joints[j] not in spreading
         ]
         if not own:
             raise ModelError(
@@ -299,7 +298,7 @@ class Robot:
         return float(np.sign(less)) if abs(less) >= CENTRED else wider
 
     def _groups(self) -> Iterator[RobotGroup]:
-        """What the description says of its groups, in numbers, the arms found where it is silent."""
+        """The groups that grasp, in numbers; arms and palms are found where none are given."""
         about, first = self.description, 0
         fingers = {j for joints in self.flexion for j in joints}
         carrying: dict[int, str] = {}
@@ -320,14 +319,19 @@ class Robot:
                         f"{self.joints[j]!r}: groups that grasp together have an arm each, "
                         "arm = [...] says which joints"
                     )
-            if not arm and any(about.contact_points[i].by_arm for i in points):
+            carried = [i for i in points if about.contact_points[i].by_arm]
+            if carried and not arm:
                 raise ModelError(f"group {group.name!r} of {about.name} has no arm to close with")
+            if len(carried) > 1:
+                one, other = (about.contact_points[i].name for i in carried[:2])
+                raise ModelError(
+                    f"the arm of group {group.name!r} of {about.name} closes {one!r} and {other!r}:"
+                    " it can close one contact point"
+                )
             adduction = None if group.adduction is None else self.index(group.adduction)
             yield RobotGroup(group.name, points, arm, adduction, body, p, R)
 
-    def _palm_of(
-        self, group: Group, points: tuple[int, ...]
-    ) -> tuple[int, np.ndarray, np.ndarray]:
+    def _palm_of(self, group: Group, points: tuple[int, ...]) -> tuple[int, np.ndarray, np.ndarray]:
         """Body of the palm, and where on it p (3,), R (3, 3): z approach axis, x opposition."""
         model, own = self.model, list(points)
         if group.palm is not None:
@@ -340,9 +344,7 @@ class Robot:
         closing = self.closing[own]
         room = np.clip(closing.sum(axis=0), self.q_lower - self.home, self.q_upper - self.home)
         half = self.home + 0.5 * room
-        v = np.einsum(
-            "kaj,kj->ka", self.jacobian(half).reshape(-1, 3, self.n)[own], closing
-        )
+        v = np.einsum("kaj,kj->ka", self.jacobian(half).reshape(-1, 3, self.n)[own], closing)
         data = self._at(half)
         z = self.centers(half)[own].mean(axis=0) - data.xpos[body]
         if np.linalg.norm(z) < CENTRED:
@@ -521,6 +523,23 @@ class Robot:
         mujoco.mj_jac(self.model, data, J[:3], J[3:], p_palm, body)
         return J @ self.coupling
 
+    def closing_at(self, q: np.ndarray) -> np.ndarray:
+        """How q moves as each contact point closes (k, n), from q (n,) on.
+
+        Flexion joints in their proportion, the fastest by 1 rad; an arm so that its palm moves by
+        1 m along its approach axis and does not turn.
+        """
+        closing = self.closing
+        for g, group in enumerate(self.groups):
+            for i in group.points:
+                if self.description.contact_points[i].by_arm:
+                    arm = list(group.arm)
+                    straight = np.append(self.palm(q, g)[1][:, 2], np.zeros(3))
+                    way = np.linalg.pinv(self.palm_jacobian(q, g)[:, arm], rcond=SINGULAR)
+                    closing = closing.copy()
+                    closing[i, arm] = way @ straight
+        return closing
+
     def group_of(self, where: str) -> int:
         """The group of a contact point, or of a link or geom that one of the arms carries.
 
@@ -534,7 +553,7 @@ class Robot:
         geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, where)
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, where)
         body = int(model.geom_bodyid[geom]) if geom >= 0 else body
-        moving = self.coupling[_chain(model, max(body, 0))].any(axis=0)
+        moving = np.abs(self.coupling[_chain(model, max(body, 0))]).sum(axis=0) > 0.0
         share = [int(moving[list(group.arm)].sum()) for group in self.groups]
         return int(np.argmax(share))
 

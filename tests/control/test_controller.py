@@ -251,7 +251,7 @@ def test_every_miss_has_a_reaction_and_an_end(robot, stack, first, reason):
             break
         if reason in (Miss.SENSOR, Miss.STUCK):
             np.testing.assert_array_equal(step.q_target, plain.q_target)
-        elif reason in (Miss.OTHER_LINK, Miss.TABLE):
+        elif reason in (Miss.OTHER_LINK, Miss.TABLE, Miss.INSIDE):
             palms = [robot.palm(q) for q in (first.q, step.q_target)]
             back = (palms[0][0] - palms[1][0]) @ palms[0][1][:, 2]
             assert back > 0.01 * len(told) - 2e-3  # at least, to first order
@@ -264,7 +264,7 @@ def test_every_miss_has_a_reaction_and_an_end(robot, stack, first, reason):
     assert last.endswith(f"misses from one grasp, the last: {reason.value} (finger_2)")
     if reason in (Miss.SENSOR, Miss.STUCK):
         assert reactions == ["the same again"] * 3
-    elif reason in (Miss.OTHER_LINK, Miss.TABLE):
+    elif reason in (Miss.OTHER_LINK, Miss.TABLE, Miss.INSIDE):
         assert reactions == [f"palm back by {10 * i} mm" for i in range(1, 6)]
     else:
         assert reactions == ["0.5 of the step", "0.25 of the step"]

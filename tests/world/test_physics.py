@@ -213,7 +213,7 @@ def test_the_palms_sensors_say_where_the_object_is_in_its_frame(scene):
     data.qpos[at : at + 7] = [0.7, 0.1, 0.3, np.cos(0.3), 0, np.sin(0.3), 0]
     mujoco.mj_forward(model, data)
     read = data.sensordata[palm_sensors(model)]
-    body = robot.model.body(robot.palm_body).name
+    body = robot.model.body(robot.groups[0].palm_body).name
     R, p = data.body(body).xmat.reshape(3, 3), data.body(body).xpos
     np.testing.assert_allclose(read[:3], R.T @ (data.qpos[at : at + 3] - p), atol=1e-9)
     turn = np.zeros(9)
