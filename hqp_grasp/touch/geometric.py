@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,11 +15,16 @@ import numpy as np
 from hqp_grasp.errors import InputError, instance, one_of
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed
 from hqp_grasp.world.objects import OBJECT
-from hqp_grasp.world.robot import CAPSULE, CYLINDER, SPHERE
+from hqp_grasp.world.robot import CAPSULE, CYLINDER, SPHERE, Robot
 from hqp_grasp.world.scene import Scene
 
 RETREAT = 0.35  # [rad] each finger opens by this much before the hand moves,
 WITHDRAWAL = 0.03  # [m] and each palm that its arm closes goes back by this
+ADVANCE = 0.1  # [m] such a palm comes on by, at most, along postures that are apart by
+STRIDE = 5e-3  # [m]
+STRAIGHT = (
+    1.05  # [–] no point of it moves faster than the palm is to, the way being nearly straight
+)
 TOUCH = 1e-9  # [m] gap at which a ball touches
 # Two meshes at gap 0 have no direction between them: there a touch ends within these gaps.
 CLOSE = (1e-9, 1e-8)  # [m]
@@ -133,11 +138,13 @@ class GeometricProbe:
         postures of the `way` joints move together, and POSTURES are looked at.
         """
         robot = self.scene.articulated
-        opening = RETREAT * robot.closing.sum(axis=0)
         met: dict[str, None] = {}
         for start, end in pairwise(way):
             for q in np.linspace(start, end, POSTURES):
-                robot.place(self._data, np.clip(q - opening, robot.q_lower, robot.q_upper))
+                opened = q.copy()
+                for finger in self._fingers(q, robot.closing):
+                    finger.put(opened, -finger.retreat)
+                robot.place(self._data, opened)
                 met |= dict.fromkeys(self._others())
         return tuple(met)
 
@@ -164,50 +171,66 @@ class GeometricProbe:
         Returns the posture that touches, q (n,) [rad], and s (k) [rad, m] there.
         """
         robot = self.scene.articulated
-        k, q = len(ways), q_target.copy()
-        lower, upper, start = robot.q_lower.tolist(), robot.q_upper.tolist(), q_target.tolist()
-        joints = [
-            [(j, start[j], lower[j], upper[j], speed) for j, speed in enumerate(way) if speed]
-            for way in ways.tolist()
-        ]
+        k, q, fingers = len(ways), q_target.copy(), self._fingers(q_target, ways)
 
         def place(s: list[float], which: Iterable[int]) -> None:
             for i in which:
-                for j, at, low, high, speed in joints[i]:
-                    q[j] = min(max(at + s[i] * speed, low), high)
+                fingers[i].put(q, s[i])
             robot.place(self._data, q)
 
-        s = [-RETREAT] * k
+        s = [-finger.retreat for finger in fingers]
         place(s, range(k))
         gaps = [self._gap(i) for i in range(k)]
         if min(gaps) < 0.0:
-            s = [_way_left(finger, -1.0) for finger in joints]
+            s = [finger.end(-1.0) for finger in fingers]
             place(s, range(k))
             gaps = [self._gap(i) for i in range(k)]
             if min(gaps) < 0.0:
                 return self._missed(Miss.INSIDE, int(np.argmin(gaps)))
-        fastest = np.einsum("kn,kn->k", np.abs(ways), robot.reach).tolist()
-        ends = [_way_left(finger, 1.0) for finger in joints]
-        free, inside = list(s), [np.inf] * k  # where each finger is known to be so
+        for by_arm in (True, False):
+            which = [i for i in range(k) if isinstance(fingers[i], _Palm) == by_arm]
+            if by_arm and not which:
+                continue
+            missed = self._close_some(which, fingers, q, s, place)
+            if missed is not None:
+                return missed
+        return q, s
+
+    def _close_some(
+        self,
+        which: list[int],
+        fingers: Sequence[_Finger | _Palm],
+        q: np.ndarray,
+        s: list[float],
+        place: Callable[[list[float], Iterable[int]], None],
+    ) -> Missed | None:
+        """Close these fingers from s on, each to its first touch; the others stay."""
+        robot = self.scene.articulated
+        gaps = {i: self._gap(i) for i in which}
+        if min(gaps.values(), default=0.0) < 0.0:  # the palm took it there
+            return self._missed(Miss.INSIDE, min(gaps, key=lambda i: gaps[i]))
+        ends = {i: fingers[i].end(1.0) for i in which}
+        free, inside = dict(enumerate(s)), dict.fromkeys(which, np.inf)  # known to be so
         for _ in range(MAX_CLOSING_STEPS):
-            moving = [i for i in range(k) if not self._touches(i, gaps[i])]
+            moving = [i for i in which if not self._touches(i, gaps[i])]
             if not moving:
-                return q, s
+                return None
             J = None  # of balls' centres: along the normal they move as the touching points do
             for i in moving:
                 if s[i] >= ends[i] and gaps[i] > 0.0:
                     return self._missed(Miss.NO_TOUCH, i)
-                goal = gaps[i] - (0.0 if self._round[i] else sum(CLOSE) / 2.0)
-                step = goal / fastest[i]  # cannot pass the first touch
+                goal, fastest = gaps[i], fingers[i].fastest
+                goal -= 0.0 if self._round[i] else sum(CLOSE) / 2.0
+                step = goal / fastest  # cannot pass the first touch
                 if gaps[i] < NEAR and (gaps[i] > 0.0 or self._round[i]):
-                    near = self._nearest(i)
+                    near, way = self._nearest(i), fingers[i].direction(q)
                     if not self._round[i]:
-                        speed = near.normal @ robot.link_jacobian(q, i, near.link) @ ways[i]
+                        speed = near.normal @ robot.link_jacobian(q, i, near.link) @ way
                     else:
                         J = robot.jacobian(q) if J is None else J
-                        speed = near.normal @ (J[3 * i : 3 * i + 3] @ ways[i])
+                        speed = near.normal @ (J[3 * i : 3 * i + 3] @ way)
                     closing_speed = -float(speed)
-                    if closing_speed > 0.05 * fastest[i]:
+                    if closing_speed > 0.05 * fastest:
                         step = goal / closing_speed
                 ahead = s[i] + step
                 if not free[i] < ahead < inside[i]:
@@ -221,6 +244,22 @@ class GeometricProbe:
                 else:
                     free[i] = max(free[i], s[i])
         return self._missed(Miss.NO_TOUCH, moving[0])
+
+    def _fingers(self, q: np.ndarray, ways: np.ndarray) -> list[_Finger | _Palm]:
+        """How each contact point closes from q (n,) on, with these ways (k, n) of flexions."""
+        robot = self.scene.articulated
+        lower, upper, start = robot.q_lower.tolist(), robot.q_upper.tolist(), q.tolist()
+        fastest = np.einsum("kn,kn->k", np.abs(ways), robot.reach).tolist()
+        fingers: list[_Finger | _Palm] = []
+        for i, (way, point) in enumerate(
+            zip(ways.tolist(), robot.description.contact_points, strict=True)
+        ):
+            if point.by_arm:
+                fingers.append(_Palm(robot, i, q))
+                continue
+            joints = [(j, start[j], lower[j], upper[j], v) for j, v in enumerate(way) if v]
+            fingers.append(_Finger(joints, ways[i], fastest[i]))
+        return fingers
 
     def _aimed(self, q: np.ndarray, ways: np.ndarray, which: Iterable[int]) -> np.ndarray:
         """The ways that change these fingers least, w = −(nᵀJ_γ)⁺; those of the others."""
@@ -338,12 +377,68 @@ class GeometricProbe:
         return robot.grasp(q, contacts, others)
 
 
-def _way_left(joints: list[tuple[int, float, float, float, float]], sign: float) -> float:
-    """s [rad] at which the last of a finger's joints reaches its range, as s grows or falls."""
-    far = (
-        ((high if sign * speed > 0.0 else low) - at) / speed for _, at, low, high, speed in joints
-    )
-    return sign * min(ALL_THE_WAY, max(sign * s for s in far))
+class _Finger(NamedTuple):
+    """Flexion joints that close a contact point, in proportion: q_j = at + s·v within its range."""
+
+    joints: list[tuple[int, float, float, float, float]]  # j, at, lower, upper, v
+    way: np.ndarray  # (n,)
+    fastest: float  # [m/rad] no point of its link moves faster with s
+
+    @property
+    def retreat(self) -> float:
+        return RETREAT
+
+    def put(self, q: np.ndarray, s: float) -> None:
+        """Set its joints in q (n,) as they are at s [rad]."""
+        for j, at, low, high, speed in self.joints:
+            q[j] = min(max(at + s * speed, low), high)
+
+    def direction(self, q: np.ndarray) -> np.ndarray:
+        """dq/ds (n,)."""
+        return self.way
+
+    def end(self, sign: float) -> float:
+        """s [rad] at which the last of its joints reaches its range, as s grows or falls."""
+        far = (
+            ((high if sign * speed > 0.0 else low) - at) / speed
+            for _, at, low, high, speed in self.joints
+        )
+        return sign * min(ALL_THE_WAY, max(sign * s for s in far))
+
+
+class _Palm:
+    """A palm that its arm closes, straight along the approach axis, s [m] ahead of where it was."""
+
+    retreat = WITHDRAWAL
+    fastest = STRAIGHT  # [–]
+
+    def __init__(self, robot: Robot, point: int, q: np.ndarray) -> None:
+        self._robot, self._point = robot, point
+        group = robot.groups[robot.group_of(robot.description.contact_points[point].name)]
+        self._arm = list(group.arm)
+        self._ways = {sign: [q] for sign in (1.0, -1.0)}  # postures every STRIDE, ahead and behind
+
+    def put(self, q: np.ndarray, s: float) -> None:
+        """Set the arm's joints in q (n,) as they are at s."""
+        way, at = self._ways[float(np.copysign(1.0, s))], abs(s) / STRIDE
+        while len(way) < at + 1.0:
+            way.append(self._next(way[-1], float(np.copysign(STRIDE, s))))
+        one, share = int(at), at - int(at)
+        two = min(one + 1, len(way) - 1)
+        q[self._arm] = ((1.0 - share) * way[one] + share * way[two])[self._arm]
+
+    def _next(self, q: np.ndarray, s: float) -> np.ndarray:
+        half = q + 0.5 * s * self.direction(q)
+        ahead = q + s * self.direction(half)
+        return np.clip(ahead, self._robot.q_lower, self._robot.q_upper)
+
+    def direction(self, q: np.ndarray) -> np.ndarray:
+        """dq/ds (n,) [rad/m]."""
+        return self._robot.closing_at(q)[self._point]
+
+    def end(self, sign: float) -> float:
+        """s [m] it may go to."""
+        return sign * (ADVANCE if sign > 0.0 else WITHDRAWAL)
 
 
 def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
