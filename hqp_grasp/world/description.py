@@ -47,7 +47,7 @@ KEYS = {  # of each table; a key that is none of these is refused
         *("degrees", "balanceinertia", "fusestatic", "package_root"),
     ),
     "group": ("name", "palm", "arm", "adduction", "contact_points"),
-    "hand": ("groups", "start"),
+    "hand": ("groups", "home", "start"),
     "palm": ("body", "pos", "approach", "opposition"),
     "contact point": (
         *("name", "link", "geom", "geoms", "ball", "site", "flexion"),
@@ -283,6 +283,7 @@ class Hand:
 
     name: str
     groups: tuple[str, ...]
+    home: Mapping[str, float] = field(default_factory=dict)  # [rad] in place of the robot's
     start: Mapping[str, Any] = field(default_factory=dict)  # ranges of a Start
 
 
@@ -345,6 +346,7 @@ class RobotDescription:
         if hand is not None:
             one_of(f"hand of {about.name}", hand, [h.name for h in about.hands])
             about = replace(about, hand_name=hand)
+            about = replace(about, home={**about.home, **about.hand.home})
         return about
 
     def __post_init__(self) -> None:
@@ -565,6 +567,7 @@ class RobotDescription:
                     pos=point.ball[:3],
                     size=[point.ball[3], 0.0, 0.0],
                     mass=0.0,
+                    material="",  # that of the body's class lacks its prefix in a joined file
                 )
 
     def _drops(self, equality: mujoco.MjsEquality) -> bool:
@@ -817,7 +820,9 @@ def _hands(groups: Sequence[Group], table: Mapping[str, object]) -> tuple[Hand, 
         if not together:
             raise InputError(f"hands.{name} is empty: it names the groups that grasp together")
         _refuse_twice(f"groups of hands.{name}", list(together))
-        hands.append(Hand(name, together, _start(about.get("start", {}))))
+        home = _table("home", about)
+        home = {j: _number(f"home of {j} in hands.{name}", v) for j, v in home.items()}
+        hands.append(Hand(name, together, home, _start(about.get("start", {}))))
     _refuse_twice("hands", [hand.name for hand in hands])
     for hand in hands:
         points = [point for name in hand.groups for point in by_name[name].contact_points]

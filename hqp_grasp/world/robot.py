@@ -595,8 +595,8 @@ class Robot:
                 f"({', '.join(p.name for p in points)}); got {len(contacts)} contacts"
             )
         places, centers = self._points.copy(), self.centers(q)
-        hand = self.description.hand.name
-        complete = []
+        groups = {i: group.name for group in self.groups for i in group.points}
+        closing, complete = self.closing_at(q), []
         for i, (contact, point) in enumerate(zip(contacts, points, strict=True)):
             radius = float(self.tip_radius[i])
             if radius == 0.0:  # no ball: the touching point, or the centre of curvature there
@@ -610,9 +610,9 @@ class Robot:
                     name=point.name,
                     body=self.model.body(int(self._bodies[i])).name,
                     point=places[i],
-                    group=hand,
+                    group=groups[i],
                     flexion=self.flexion[i],
-                    closing=self.closing[i],
+                    closing=closing[i],
                     tip_radius=radius,
                 )
             )
@@ -630,7 +630,10 @@ class Robot:
             coupling=self.coupling,
             offset=self.offset,
             other_links=other_links,
-            frames=(Frame(hand, *self.palm(q), self.palm_jacobian(q)),),
+            frames=tuple(
+                Frame(group.name, *self.palm(q, g), self.palm_jacobian(q, g))
+                for g, group in enumerate(self.groups)
+            ),
             model=self.model,
         )
 
