@@ -820,8 +820,8 @@ def _hands(groups: Sequence[Group], table: Mapping[str, object]) -> tuple[Hand, 
         if not together:
             raise InputError(f"hands.{name} is empty: it names the groups that grasp together")
         _refuse_twice(f"groups of hands.{name}", list(together))
-        home = _table("home", about)
-        home = {j: _number(f"home of {j} in hands.{name}", v) for j, v in home.items()}
+        own = _table("home", about)
+        home = {j: _number(f"home of {j} in hands.{name}", v) for j, v in own.items()}
         hands.append(Hand(name, together, home, _start(about.get("start", {}))))
     _refuse_twice("hands", [hand.name for hand in hands])
     for hand in hands:

@@ -701,14 +701,123 @@ def test_a_table_of_joints_must_be_one(tmp_path, line):
     refused(lambda: written(tmp_path, toml=SHORT.replace('"tiny.xml"', "[]")), "model is empty")
 
 
-def test_two_hands_of_one_name_are_refused(tmp_path):
-    hand = '[[groups]]\nname = "left"\ncontact_points = [{ link = "distal" }]\n'
-    toml = 'model = "tiny.xml"\n' + hand + hand
-    refused(lambda: written(tmp_path, NO_KEYS, toml), "two hands are named 'left'")
-    hand = hand.replace('"distal" }', '"distal", name = "tip", ball = { radius = 0.01 } }')
-    toml = 'model = "tiny.xml"\n' + hand + hand.replace("left", "right")
-    words = "two contact points with a ball are named 'tip'"
+GROUP = '[[groups]]\nname = "left"\ncontact_points = [{ link = "distal", name = "tip" }]\n'
+
+
+def test_two_groups_of_one_name_are_refused(tmp_path):
+    toml = 'model = "tiny.xml"\n' + GROUP + GROUP
+    refused(lambda: written(tmp_path, NO_KEYS, toml), "two groups are named 'left'")
+
+
+@pytest.mark.parametrize(
+    ("hands", "words"),
+    [
+        ('both = ["left", "right"]', "two contact points of hand 'both' are named 'tip'"),
+        ('both = ["left", "wrong"]', "hands.both: no group 'wrong'; they are: left, right"),
+        ('both = ["left", "left"]', "two groups of hands.both are named 'left'"),
+        ("both = []", "hands.both is empty: it names the groups that grasp together"),
+        ('left = ["right"]', "two hands are named 'left'"),
+        ('both = { groups = ["left"], starts = 1 }', "unknown entry 'starts'"),
+    ],
+)
+def test_a_hand_of_groups_is_refused_for_what_is_wrong_with_it(tmp_path, hands, words):
+    toml = f'model = "tiny.xml"\n[hands]\n{hands}\n' + GROUP + GROUP.replace("left", "right")
     refused(lambda: written(tmp_path, NO_KEYS, toml), words)
+
+
+def test_hands_as_they_were_once_written_are_told_how_to_be_now(tmp_path):
+    toml = 'model = "tiny.xml"\n' + GROUP.replace("groups", "hands")
+    refused(lambda: written(tmp_path, NO_KEYS, toml), "hands names groups", "a group is [[groups]]")
+
+
+TWO = """<mujoco><compiler angle="radian"/><worldbody>
+<body name="waist"><joint name="waist" axis="0 0 1" range="-1 1"/><geom size=".01"/>
+  <body name="palm_a" pos="0 .1 0"><joint name="arm_a" axis="1 0 0" range="-1 1"/>
+    <geom size=".01"/>
+    <body name="tip_a" pos="0 0 .1"><joint name="close_a" axis="1 0 0" range="-1 1"/>
+      <geom name="ball_a" size=".01" pos="0 0 .05"/></body></body>
+  <body name="palm_b" pos="0 -.1 0"><joint name="arm_b" axis="1 0 0" range="-1 1"/>
+    <geom size=".01"/>
+    <body name="tip_b" pos="0 0 .1"><joint name="close_b" axis="1 0 0" range="-1 1"/>
+      <geom name="ball_b" size=".01" pos="0 0 .05"/></body></body>
+</body></worldbody>%s</mujoco>"""
+ARMS = """
+model = "tiny.xml"
+hands.both = ["a", "b"]
+[[groups]]
+name = "a"
+palm = { body = "palm_a" }
+arm = ["arm_a"]
+contact_points = [{ link = "tip_a", flexion = ["close_a"] }]
+[[groups]]
+name = "b"
+palm = { body = "palm_b" }
+arm = ["arm_b"]
+contact_points = [{ link = "tip_b", flexion = ["close_b"] }]
+"""
+
+
+def two_arms(tmp_path, xml=TWO % "", toml=ARMS, hand="both"):
+    (tmp_path / "tiny.xml").write_text(xml)
+    (tmp_path / "robot.toml").write_text(toml)
+    about = RobotDescription.load(tmp_path, hand)
+    return Robot(about, compiled(about))
+
+
+def test_groups_that_grasp_together_keep_their_own_palms_arms_and_points(tmp_path):
+    robot = two_arms(tmp_path)
+    assert [g.name for g in robot.groups] == ["a", "b"]
+    assert [g.points for g in robot.groups] == [(0,), (1,)]
+    named = [[robot.joints[j] for j in g.arm] for g in robot.groups]
+    assert named == [["arm_a"], ["arm_b"]] and robot.arm == (1, 3)
+    for g, y in ((0, 0.1), (1, -0.1)):
+        np.testing.assert_allclose(robot.palm(robot.home, g)[0], [0.0, y, 0.0], atol=1e-12)
+    wheres = ["tip_a", "tip_b", "palm_a", "palm_b", "ball_b"]
+    assert [robot.group_of(where) for where in wheres] == [0, 1, 0, 1, 1]
+    J = robot.palm_jacobian(robot.home, 1)
+    assert J[3:, 1].tolist() == [0.0, 0.0, 0.0] and J[3:, 3].tolist() == [1.0, 0.0, 0.0]
+    alone = two_arms(tmp_path, hand="b")
+    assert [g.name for g in alone.groups] == ["b"] and alone.idle.tolist() == [0, 1, 1, 0, 0]
+
+
+def test_groups_that_share_an_arm_cannot_grasp_together(tmp_path):
+    toml = ARMS.replace('arm = ["arm_b"]', 'arm = ["arm_b", "arm_a"]')
+    refused(
+        lambda: two_arms(tmp_path, toml=toml),
+        "groups 'a' and 'b'",
+        "share the arm joint 'arm_a'",
+        "have an arm each",
+    )
+    two_arms(tmp_path, toml=toml, hand="b")
+
+
+def test_a_coupling_across_groups_is_refused(tmp_path):
+    equality = '<equality><joint joint1="close_b" joint2="close_a"/></equality>'
+    refused(
+        lambda: two_arms(tmp_path, TWO % equality),
+        "moves groups 'a' and 'b' by a coupling",
+    )
+
+
+def test_an_arm_closes_one_contact_point_straight_along_its_palms_axis(tmp_path):
+    toml = ARMS.replace('flexion = ["close_a"]', 'flexion = "arm"')
+    robot = two_arms(tmp_path, toml=toml)
+    assert not robot.closing[0].any()
+    way = robot.closing_at(robot.home)[0]
+    assert np.flatnonzero(way).tolist() in ([], [1])  # by its own arm alone
+    more = toml.replace(
+        'flexion = "arm" }]', 'flexion = "arm" }, { link = "palm_a", flexion = "arm" }]'
+    )
+    refused(lambda: two_arms(tmp_path, toml=more), "closes 'tip_a' and 'palm_a'", "can close one")
+    bare = toml.replace('arm = ["arm_a"]', "arm = []")
+    refused(lambda: two_arms(tmp_path, toml=bare), "has no arm to close with")
+
+
+def test_a_hands_own_home_stands_in_place_of_the_robots(tmp_path):
+    both = 'hands.both = { groups = ["a", "b"], home = { arm_b = 0.3 } }'
+    robot = two_arms(tmp_path, toml=ARMS.replace('hands.both = ["a", "b"]', both))
+    assert robot.home.tolist() == [0.0, 0.0, 0.0, 0.3, 0.0]
+    assert not two_arms(tmp_path, hand="a").home.any()
 
 
 WELD = '<weld name="hold" body1="distal" body2="palm"/>'
