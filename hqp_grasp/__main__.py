@@ -29,7 +29,7 @@ def run(scenario: Positional[str], /) -> None:
     """Run a scenario; the rest are its own arguments: `run cylinder --help` lists them.
 
     Args:
-        scenario: cylinder, cylinder_65, hexagon, irregular, prism or object.
+        scenario: cylinder, cylinder_65, hexagon, irregular, drum, box, beam, prism or object.
     """
     runpy.run_module(f"hqp_grasp.scenarios.{_scenario(scenario)}", run_name="__main__")
 
@@ -42,7 +42,7 @@ def pick(scenario: Positional[str], /) -> None:
     friction believed in. Writes DIR/picks.parquet, one row a trial.
 
     Args:
-        scenario: cylinder, cylinder_65, hexagon, irregular, prism or object.
+        scenario: cylinder, cylinder_65, hexagon, irregular, drum, box, beam, prism or object.
     """
     picking.main(_scenario(scenario))
 

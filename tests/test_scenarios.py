@@ -21,6 +21,11 @@ OBJECTS = {
     "hexagon": hg.Prism.regular(6, 0.06),
     "irregular": hg.Prism(CORNERS),
 }
+TWO_ARMED = {
+    "drum": ("both", hg.Cylinder(0.2, 0.4)),
+    "box": ("both", hg.Prism.box(0.3, 0.4, 0.3)),
+    "beam": ("palms", hg.Prism.box(0.1, 0.6, 0.1)),
+}
 FROM_FILES = ("object", "prism")
 
 
@@ -40,10 +45,10 @@ def call(monkeypatch, module, *arguments):
 
 def test_there_is_a_scenario_for_every_object_of_the_paper_and_for_files():
     names = {path.stem for path in FOLDER.glob("*.py")} - {"__init__"}
-    assert names == {*OBJECTS, *FROM_FILES}
+    assert names == {*OBJECTS, *TWO_ARMED, *FROM_FILES}
 
 
-@pytest.mark.parametrize("name", [*OBJECTS, *FROM_FILES])
+@pytest.mark.parametrize("name", [*OBJECTS, *TWO_ARMED, *FROM_FILES])
 def test_a_scenario_is_short(name):
     assert 10 <= len((FOLDER / f"{name}.py").read_text().splitlines()) <= 60
 
@@ -52,6 +57,14 @@ def test_a_scenario_is_short(name):
 def test_a_scenario_declares_its_object(name):
     scene = runpy.run_path(str(FOLDER / f"{name}.py"))["scene"]
     assert scene == hg.Scene(object=OBJECTS[name])
+
+
+@pytest.mark.parametrize("name", TWO_ARMED)
+def test_a_scenario_of_two_arms_declares_its_object_and_what_grasps_it(name):
+    scene = runpy.run_path(str(FOLDER / f"{name}.py"))["scene"]
+    hand, thing = TWO_ARMED[name]
+    assert scene == hg.Scene("umass_torso", thing, hand=hand)
+    assert len(scene.articulated.groups) == 2
 
 
 def test_three_unit_forces_never_balance_on_the_faces_of_the_irregular_prism_alone():

@@ -103,7 +103,7 @@ class Settings:
     robot: str | None = None
     """Another robot than the scenario's: a name, or the path of a description."""
     hand: str | None = None
-    """The hand that grasps, of a robot with several: right or left."""
+    """What grasps, of a robot with several hands: right, left, both, palms, as it names them."""
     replay: int = 0
     """The trial that replay.html plays."""
     view: bool = False

@@ -99,6 +99,12 @@ class Prism:
         return cls(tuple(map(tuple, corners)), height)
 
     @classmethod
+    def box(cls, x: float, y: float, z: float) -> Prism:
+        """A box with sides of these lengths [m] along the axes."""
+        x, y = positive("Prism.box x", x) / 2.0, positive("Prism.box y", y) / 2.0
+        return cls(((-x, -y), (x, -y), (x, y), (-x, y)), z)
+
+    @classmethod
     def centred(cls, corners: np.ndarray, height: float = 0.12) -> Prism:
         """The prism over `corners` (m, 2) [m], wherever they lie: their centroid is its middle."""
         return cls(tuple(map(tuple, corners - centroid(corners))), height)

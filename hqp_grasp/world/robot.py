@@ -154,9 +154,9 @@ class Robot:
         moves = self._ancestor @ (C != 0.0)  # (k, n)
         put("idle", ~moves.any(axis=0))
         put("reach", np.array([_reach(model, v) for v in links]) @ np.abs(C))
+        self._refuse_coupled(chains)
         put("closing", self._closing(independent, moves))
         put("flexion", tuple(tuple(np.flatnonzero(w).tolist()) for w in self.closing))
-        self._refuse_coupled(chains)
         put("groups", tuple(self._groups()))
         put("arm", tuple(sorted({j for group in self.groups for j in group.arm})))
 

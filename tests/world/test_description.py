@@ -730,7 +730,7 @@ def test_hands_as_they_were_once_written_are_told_how_to_be_now(tmp_path):
     refused(lambda: written(tmp_path, NO_KEYS, toml), "hands names groups", "a group is [[groups]]")
 
 
-TWO = """<mujoco><compiler angle="radian"/><worldbody>
+TORSO = """<mujoco><compiler angle="radian"/><worldbody>
 <body name="waist"><joint name="waist" axis="0 0 1" range="-1 1"/><geom size=".01"/>
   <body name="palm_a" pos="0 .1 0"><joint name="arm_a" axis="1 0 0" range="-1 1"/>
     <geom size=".01"/>
@@ -757,7 +757,7 @@ contact_points = [{ link = "tip_b", flexion = ["close_b"] }]
 """
 
 
-def two_arms(tmp_path, xml=TWO % "", toml=ARMS, hand="both"):
+def two_arms(tmp_path, xml=TORSO % "", toml=ARMS, hand="both"):
     (tmp_path / "tiny.xml").write_text(xml)
     (tmp_path / "robot.toml").write_text(toml)
     about = RobotDescription.load(tmp_path, hand)
@@ -794,7 +794,7 @@ def test_groups_that_share_an_arm_cannot_grasp_together(tmp_path):
 def test_a_coupling_across_groups_is_refused(tmp_path):
     equality = '<equality><joint joint1="close_b" joint2="close_a"/></equality>'
     refused(
-        lambda: two_arms(tmp_path, TWO % equality),
+        lambda: two_arms(tmp_path, TORSO % equality),
         "moves groups 'a' and 'b' by a coupling",
     )
 
