@@ -37,7 +37,7 @@ def test_a_scenario_runs_by_its_name_and_is_reported(monkeypatch, capsys, tmp_pa
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("run", "cyclinder"), "unknown scenario 'cyclinder'; choose one of: beam, box, cylinder, "),
+        (("run", "cyclinder"), "unknown scenario 'cyclinder'; choose one of: beam, box, c"),
         (("report",), "at least one results folder"),
         (("report", "nowhere"), "no results folder"),
         (("view", "nowhere"), "there is no folder nowhere"),

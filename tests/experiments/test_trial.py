@@ -300,7 +300,7 @@ def test_misses_shorten_the_step_then_the_trial_is_lost(scene, stack, records):
 
 def test_the_row_of_a_loss_tells_the_reason_and_later_rows_are_empty(scene, stack, records):
     first = records[SEEDS[0]].grasps[0]
-    hand = Replay(first, MISSED, Missed(Miss.INSIDE, "finger_1"), MISSED)
+    hand = Replay(first, MISSED, Missed(Miss.OWN_LINK, "finger_1"), MISSED)
     rows = Trial(scene, stack, probes=6, form="memoryless").run(SEEDS[0], hand).rows
     errors = ("eps_f", "eps_m", "eps_k", "eps_k_eq7", "adduction_deg", "elevation_deg")
     for row, share in zip(rows[1:4], SHARES, strict=True):
@@ -308,7 +308,7 @@ def test_the_row_of_a_loss_tells_the_reason_and_later_rows_are_empty(scene, stac
         assert row["limit_violation"] == 0.0
         assert all(row[name] is None for name in errors)
     told = [row["outcome"] for row in rows[1:5]]
-    lost, inside = f"{Miss.NO_TOUCH.value} (finger_2)", f"{Miss.INSIDE.value} (finger_1)"
+    lost, inside = f"{Miss.NO_TOUCH.value} (finger_2)", f"{Miss.OWN_LINK.value} (finger_1)"
     assert told == [
         lost,
         inside,
