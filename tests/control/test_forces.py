@@ -452,3 +452,91 @@ def test_a_grip_balances_first_touches_where_friction_allows(first):
     demand = friction_demand(grasp.positions, grasp.normals)
     enough = hg.Grip(robot, friction=1.1 * demand / np.cos(np.pi / 8)).solve(grasp)
     assert short(enough, "net force") == 0.0
+
+
+# ---------------------------------------------------------------- reports and levels
+
+
+def test_each_law_at_one_priority_is_short_by_its_own_rows(robot):
+    """The first three rows of the level are the force's, the last three the moment's."""
+    both = (NetForce() + NetMoment() >> GripStrength()).within(JointTorques(), FrictionPyramids())
+    for lean, load in ((1.2, [0.0, 0, 0, 0, 0, 0.02]), (1.3, [0.0, 0, 4.0, 0.1, 0, 0])):
+        squeeze = hg.Grip(robot, laws=both).solve(walls(robot, lean=lean), wrench=load)
+        residual = squeeze.solution.levels[2].residual
+        assert len(residual) == 6 and residual.any()
+        assert short(squeeze, "net force") == pytest.approx(np.linalg.norm(residual[:3]))
+        assert short(squeeze, "net moment") == pytest.approx(np.linalg.norm(residual[3:]))
+
+
+def test_reports_name_every_law_with_its_unit_limits_first(robot):
+    squeeze = hg.Grip(robot, force=4.0, friction=0.2).solve(walls(robot, lean=0.5))
+    assert [(each.law, each.unit) for each in squeeze.reports] == [
+        ("joint torques", "N·m"),
+        ("friction pyramids", "N"),
+        ("normal forces", "N"),
+        ("net force", "N"),
+        ("grip strength", "N"),
+        ("margins", "N"),
+        ("net moment", "N·m"),
+        ("least force", "N"),
+    ]
+    assert str(report(squeeze, "normal forces")) == "normal forces: met"
+    assert {each.law for each in squeeze.short} == {r.law for r in squeeze.reports if r.short > 0}
+
+
+def test_torques_told_are_within_the_motors_limits_to_the_last_bit():
+    """An answer is right to rounding; a driver refuses what is beyond."""
+    about = RobotDescription.load("bhand")
+    robot = hg.Robot(about, compiled(about))
+    x, n = robot.centers(robot.home), np.array([[0.0, 1, 0], [0, 1, 0], [0, -1.0, 0]])
+    contacts = [hg.Contact(p, m, body=b) for p, m, b in zip(x, n, LINKS, strict=False)]
+    grasp = hg.Grasp(robot.home, tuple(contacts), np.zeros((9, robot.n)))
+    most = np.abs(hg.Grip(robot).solve(grasp).torque).max()
+    for share in (0.3, 0.5, 0.7, 0.9):
+        robot.model.actuator_forcerange[:] = [-share * most, share * most]
+        grip = hg.Grip(robot)
+        felt, squeeze = grip.felt(grasp), grip.solve(grasp)
+        assert (squeeze.torque <= felt.torque_upper).all()
+        assert (squeeze.torque >= felt.torque_lower).all()
+        at = np.isclose(squeeze.torque, felt.torque_upper) | np.isclose(
+            squeeze.torque, felt.torque_lower
+        )
+        assert at.any()
+
+
+def test_levels_are_posed_as_their_laws_say(robot):
+    """x = (f, s): nine forces and three margins."""
+    grip = hg.Grip(robot, force=4.0, friction=0.5, most=9.0)
+    felt = grip.felt(walls(robot))
+    torques, pyramids, normals, force, strength, margins, moment, least = grip.levels(felt)
+    assert all(level.A.shape[1] == 12 for level in grip.levels(felt))
+    n = felt.grasp.normals
+    f = np.random.default_rng(0).normal(size=(3, 3))
+    x = np.concatenate([f.ravel(), [0.1, 0.2, 0.3]])
+    np.testing.assert_allclose(normals.A @ x, -(n * f).sum(axis=1))
+    np.testing.assert_array_equal(normals.lower, 0.2 * 4.0)
+    np.testing.assert_array_equal(normals.upper, 9.0)
+    np.testing.assert_allclose(force.A @ x, f.sum(axis=0))
+    np.testing.assert_allclose(strength.A @ x, [-(n * f).sum()])
+    assert strength.lower == strength.upper == [12.0]
+    np.testing.assert_array_equal((margins.A @ x, margins.upper), ([0.1, 0.2, 0.3], [np.inf] * 3))
+    slope = 0.5 * np.cos(np.pi / 8)
+    np.testing.assert_allclose(margins.lower, 4.0 * slope / np.hypot(1.0, slope))
+    around = felt.grasp.positions - felt.grasp.positions.mean(axis=0)
+    np.testing.assert_allclose(moment.A @ x, np.cross(around, f).sum(axis=0))
+    np.testing.assert_array_equal(least.A @ x, f.ravel())
+    assert len(pyramids.A) == 3 * 8 + 3 and (pyramids.upper == 0.0).all()
+    squeezed = np.concatenate([(-4.0 * n).ravel(), margins.lower])
+    faces = pyramids.A @ squeezed
+    np.testing.assert_allclose(faces[:24], 0.0, atol=1e-9)  # as far inside as that
+    np.testing.assert_allclose(faces[24:], -margins.lower)
+    moved = felt.torque.any(axis=1)
+    np.testing.assert_allclose(torques.A @ x, (felt.torque @ f.ravel())[moved])
+
+
+def test_by_default_a_grip_presses_with_five_newtons_and_fifteen_at_most(robot):
+    assert (hg.Grip(robot).force, hg.Grip(robot).friction, hg.Grip(robot).most) == (5.0, 0.5, 15.0)
+    assert NormalForces().least == 0.2 and hg.Grip(robot).laws == hg.GRIP_LAWS
+    for least in (-0.1, 1.1):
+        with pytest.raises(InputError, match="is a share of the mean"):
+            NormalForces(least)

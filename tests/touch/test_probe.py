@@ -725,3 +725,13 @@ def test_a_finger_that_nothing_closes_is_refused(tmp_path):
     scene = Scene(tiny_hand.write(tmp_path, toml=toml), Cylinder(0.02), (0.1, 0.1, 0.0))
     with pytest.raises(InputError, match="finger has no flexion joint"):
         GeometricProbe(scene)
+
+
+def test_a_ball_touches_within_a_nanometre_and_what_is_no_ball_a_little_off():
+    """Two flat things at gap 0 have no direction between them."""
+    balls = GeometricProbe(Scene())
+    for gap, touches in ((0.0, True), (0.9e-9, True), (-0.9e-9, True), (1.1e-9, False)):
+        assert balls._touches(0, gap) is touches and balls._touches(0, -gap) is touches
+    object.__setattr__(balls, "_round", (False,) * 3)
+    gaps = (-0.9e-9, 0.0, 0.9e-9, 1.1e-9, 9.9e-9, 10.1e-9)
+    assert [balls._touches(0, gap) for gap in gaps] == [False, False, False, True, True, False]
