@@ -20,7 +20,7 @@ from hqp_grasp.mechanics import FLOOR, arm, grasp_map, margin, net_wrench, pyram
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.statics import contact_jacobian, torque_limits, weight_torque
 
-COLD = HQP("daqp")  # the quickest from nothing; from a similar answer the active-set search is
+QUICKEST = HQP("daqp")  # for the many inequalities of forces
 EDGES = 8  # of the pyramids, which keep 0.92 of the cones' friction in the worst direction
 ROUNDING = 1e-6  # [–] of a joint's torques, by which an answer may be beyond their limit
 
@@ -270,7 +270,7 @@ class Grip:
     friction: float = 0.5  # µ [–] that is believed
     most: float = 15.0  # [N] of normal force at one contact
     laws: Forces = GRIP_LAWS
-    hqp: HQP = COLD
+    hqp: HQP = QUICKEST
     _limits: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)  # (n,) each [N·m]
 
     def __post_init__(self) -> None:
@@ -319,14 +319,13 @@ class Grip:
 
         `wrench` (6,) [N, N·m] is what the contacts shall give to the object, about their centroid:
         what they are felt to give unless told otherwise, none where nothing is felt. `warm` is the
-        answer for a similar grasp with as many contacts, where the active-set search starts from.
+        answer for a similar grasp with as many contacts, whose active rows are tried first.
         """
         felt = self.felt(grasp, wrench)
         levels = self.levels(felt)
         start = warm.solution if warm is not None else None
-        hqp = self.hqp if start is None else replace(self.hqp, solver="active-set")
         try:
-            solution = hqp.solve(levels, start)
+            solution = self.hqp.solve(levels, start)
         except SolverError as error:
             return Squeeze(None, None, None, reason=f"no forces found: {error}")
         if not solution.certified:
@@ -436,7 +435,7 @@ def normal_null_space(robot: Robot, grasp: Grasp, total: float) -> np.ndarray:
     x, k = grasp.positions, grasp.k
     G = grasp_map(x, x.mean(axis=0)) @ _blocks(-grasp.normals[:, None, :]).T  # (6, k)
     G[3:] /= arm(x)
-    answer = COLD.solve(
+    answer = QUICKEST.solve(
         [
             Level(np.eye(k), np.zeros(k), np.full(k, np.inf), "push"),
             Level.equal(np.ones((1, k)), np.array([total]), "strength"),

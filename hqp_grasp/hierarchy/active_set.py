@@ -711,7 +711,7 @@ def _unwilling(off, levels, act, frobenius, row_norm, length, kept, single, late
 
 
 @njit(cache=True, error_model="numpy")
-def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks, budget):
+def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks, most, budget):
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
     See `search`. Returns x (n,), the multipliers (M, p + 1) explained at `_column`, rank (p,), the
@@ -746,7 +746,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
     step = -1
     while True:
         step += 1
-        last_step = spent >= budget  # what is found there is returned as it is
+        last_step = spent >= budget or step >= most  # what is found there is returned as it is
         if last_step:
             levels = p
         if reduced < 0:
@@ -835,7 +835,7 @@ def _search(A, lower, upper, off, act, frobenius, row_norm, floor, first, blocks
 
 
 def search(
-    rows: Stacked, act: np.ndarray, first: int, blocks: int, budget: int
+    rows: Stacked, act: np.ndarray, first: int, blocks: int, most: int, budget: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
     """Find the active set of the lexicographic optimum, starting from `act` (changed in place).
 
@@ -845,8 +845,8 @@ def search(
     primal method does that improves the levels in their order at every step (LexLSI, Dimitrov,
     Sherikov & Wieber 2015): from there, where few rows are wrong, and when that has taken n steps
     from where the levels before were settled, which is surer. With blocks = 0 it is that method
-    from x = 0. Ends when `budget` multiply-adds, about, are spent; whether it found the optimum is
-    for the certificate to say.
+    from x = 0. Ends after `most` steps, or when `budget` multiply-adds, about, are spent; whether
+    it found the optimum is for the certificate to say.
 
     Returns x (n,), the multipliers (M, p + 1) that should prove it, rank (p,), the steps made, and
     the multiply-adds spent.
@@ -866,5 +866,6 @@ def search(
         rows.floor,
         first,
         blocks,
+        most,
         budget,
     )

@@ -22,8 +22,12 @@ from hqp_grasp.hierarchy.qp_solvers import BACKENDS, QPSolverError, active_rows
 
 COARSE = 1e-13  # [–] rank tolerance where the answer by the default's is not certified
 OTHERS = ("daqp", "proxqp")  # asked where neither the chosen solver nor the search is certified
-MOST = 1e15  # [multiply-adds] days: no budget, and near to what an integer holds
+MOST = 10**15  # [multiply-adds, steps] days: no budget, and near to what an integer holds
 ROUNDS = 10  # in which many rows may change at once, before the search moves one row at a time
+
+# Its name, the levels as it sees them, the active set to start from, and how many levels it takes
+# in at first, rounds and steps it makes.
+Way = tuple[str, Stacked, np.ndarray, int, int, int]
 
 
 def solvers() -> tuple[str, ...]:
@@ -38,7 +42,7 @@ class HQP:
 
     A QP solver ("proxqp", "daqp", …) solves level after level in the freedom left, and so names
     the inequality rows that hold x; these are settled exactly, as equalities. "active-set" finds
-    them by itself: it starts from the equalities alone, or from the active set of `warm`.
+    them by itself, starting from the equalities alone.
 
     The answer is certified: optimality is checked from x and the levels. Where that fails, the
     search from the equalities is tried, then the other QP solvers, then the search that moves one
@@ -65,8 +69,8 @@ class HQP:
     def solve(self, levels: Level | Sequence[Level], warm: Solution | None = None) -> Solution:
         """Return the optimum of `levels`, first level first.
 
-        `warm`: the solution of a similar hierarchy, whose active set "active-set" tries first.
-        Where it does not fit that costs time; a QP solver makes no use of it.
+        `warm`: the solution of a similar hierarchy, whose active set is tried first, whatever the
+        solver. Where it does not fit that costs a little time.
         Raises InputError for levels that disagree on the number of unknowns and for a `warm` that
         is no Solution, and SolverError where no way leads to a finite x: numbers beyond the range
         of doubles.
@@ -81,12 +85,17 @@ class HQP:
         failed: list[str] = []
         found: list[tuple[tuple[int, float], Solution]] = []
         left = self.budget
-        for method, seen, act, first, rounds in self._ways(rows, warm, failed):
+        for method, seen, act, first, rounds, steps in self._ways(rows, warm, failed):
             # A guess that needs many steps is dropped: from the equalities the search is surer.
             guess = rounds > 0 and first > 1
             most = left // 4 if guess else left - left // 3
-            x, multipliers, rank, _, spent = active_set.search(seen, act, first, rounds, most)
+            x, multipliers, rank, made, spent = active_set.search(
+                seen, act, first, rounds, steps, most
+            )
             left -= min(spent, left)
+            if made == steps:
+                failed.append(f"{method}: not settled from the warm start in {steps} steps")
+                continue
             judged = optimality(rows, x, multipliers, shortest=True)
             off = rows.offsets.tolist()
             reports = [
@@ -117,27 +126,25 @@ class HQP:
         _, best = max(found, key=lambda each: each[0])
         return replace(best, failed=tuple(failed))
 
-    def _ways(
-        self, rows: Stacked, warm: Solution | None, failed: list[str]
-    ) -> Iterator[tuple[str, Stacked, np.ndarray, int, int]]:
-        """What to try in turn: its name, the active set to start from, levels, rounds."""
+    def _ways(self, rows: Stacked, warm: Solution | None, failed: list[str]) -> Iterator[Way]:
+        """What to try in turn."""
         p = len(rows.frobenius)
         equalities = 2 * (rows.lower == rows.upper).view(np.int8)
-        if self.solver != "active-set":
-            yield from _asked(self.solver, rows, failed)
-        elif warm is not None and warm.active.shape == equalities.shape:
+        if warm is not None and warm.active.shape == equalities.shape:
             act = equalities.copy()
             upper = (warm.active == 1) & (act == 0) & np.isfinite(rows.upper)
             lower = (warm.active == -1) & (act == 0) & np.isfinite(rows.lower)
             act[upper], act[lower] = 1, -1
-            yield "active-set", rows, act, p, ROUNDS
-        yield "active-set", rows, equalities.copy(), 1, ROUNDS
+            yield "active-set", rows, act, p, ROUNDS, ROUNDS
+        if self.solver != "active-set":
+            yield from _asked(self.solver, rows, failed)
+        yield "active-set", rows, equalities.copy(), 1, ROUNDS, MOST
         for other in OTHERS:
             if other != self.solver:
                 yield from _asked(other, rows, failed)
         coarse = 2.0 * self.rank_tolerance if self.rank_tolerance else COARSE
-        yield "coarser rank", rows.with_rank(coarse), equalities.copy(), 1, ROUNDS
-        yield "one row at a time", rows, equalities.copy(), p, 0
+        yield "coarser rank", rows.with_rank(coarse), equalities.copy(), 1, ROUNDS, MOST
+        yield "one row at a time", rows, equalities.copy(), p, 0, MOST
 
     def damped(
         self,
@@ -188,16 +195,14 @@ class HQP:
         return held
 
 
-def _asked(
-    solver: str, rows: Stacked, failed: list[str]
-) -> Iterator[tuple[str, Stacked, np.ndarray, int, int]]:
+def _asked(solver: str, rows: Stacked, failed: list[str]) -> Iterator[Way]:
     """The way that a QP solver names; none, and a line in `failed`, where it names none."""
     try:
         act = active_rows(rows, BACKENDS[solver])
     except QPSolverError as failure:
         failed.append(f"{solver}: {failure}")
     else:
-        yield solver, rows, act, len(rows.frobenius), ROUNDS
+        yield solver, rows, act, len(rows.frobenius), ROUNDS, MOST
 
 
 def _numbers(value: object) -> np.ndarray:

@@ -72,13 +72,13 @@ def active_rows(rows: Stacked, backend: Backend) -> np.ndarray:
                 raise QPSolverError(f"level {k}: {reason}") from error
             if not (np.isfinite(y).all() and np.isfinite(z).all()):
                 raise QPSolverError(f"level {k}: the answer is not finite")
+        dust = 10.0 * SLIGHT * float(np.abs(y).max(initial=1.0))  # duals that SLIGHT alone makes
         y = size * y
         if k < p:
-            x, Z = _take_in(
-                A, lower, upper, off, rows.row_norm, rows.floor, state, act, x, Z, k, y, z, index
-            )
+            sizes = (rows.row_norm, rows.floor, size, dust)
+            x, Z = _take_in(A, lower, upper, off, sizes, state, act, x, Z, k, y, z, index)
         else:
-            _hold(lower, upper, act, state, z, index)
+            _hold(lower, upper, act, state, z, index, dust)
         if Z.shape[1] == 0:
             break
     act[(lower == upper)] = 2
@@ -186,47 +186,51 @@ def _pose(A, lower, upper, off, unit, state, x, Z, k):  # type: ignore[no-untype
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(lower, upper, act, state, z, index):  # type: ignore[no-untyped-def]
+def _hold(lower, upper, act, state, z, index, dust):  # type: ignore[no-untyped-def]
     """Rows met above that a level pushes against hold x from now on, at the bound it pushes to."""
-    largest = 1.0
-    for c in range(len(index)):
-        largest = max(largest, abs(z[c]))
     for c in range(len(index)):
         i = index[c]
         bound = upper[i] if z[c] > 0.0 else lower[i]
-        if state[i] == MET and abs(z[c]) > AT_BOUND * largest and np.isfinite(bound):
+        if state[i] == MET and abs(z[c]) > dust and np.isfinite(bound):
             act[i] = 1 if z[c] > 0.0 else -1
             state[i] = HOLDS
 
 
 @njit(cache=True, error_model="numpy")
-def _take_in(A, lower, upper, off, unit, floor, state, act, x, Z, k, y, z, index):  # type: ignore[no-untyped-def]
+def _take_in(A, lower, upper, off, sizes, state, act, x, Z, k, y, z, index):  # type: ignore[no-untyped-def]
     """Step to the level's optimum; return x and the freedom that its rows leave, (n,) and (n, d).
 
     Its equalities, its rows that cannot be met, and rows above that hold x take freedom away.
     """
+    unit, floor, size, dust = sizes
     n, d = Z.shape
     x = x.copy()
     for j in range(n):
         for a in range(d):
             x[j] += Z[j, a] * y[a]
-    length = 1.0
+    length = 0.0
     for j in range(n):
         length += abs(x[j])
+    slack = max(AT_BOUND * size, ROUNDING * length)  # of a row of length 1, that is none
     before = state.copy()
-    _hold(lower, upper, act, state, z, index)
+    over = np.zeros(len(A))
+    missed = False
     for i in range(off[k], off[k + 1]):
         value = 0.0
         for j in range(n):
             value += A[i, j] * x[j]
-        over = max(value - upper[i], 0.0) + min(value - lower[i], 0.0)
+        over[i] = max(value - upper[i], 0.0) + min(value - lower[i], 0.0)
+        missed |= unit[i] > 0.0 and abs(over[i]) > slack * unit[i]
+    if missed:  # else nothing keeps x from what is asked: duals are what SLIGHT makes
+        _hold(lower, upper, act, state, z, index, dust)
+    for i in range(off[k], off[k + 1]):
         state[i] = MET
         if lower[i] == upper[i]:
             state[i] = HOLDS
         elif unit[i] == 0.0 or (lower[i] == -np.inf and upper[i] == np.inf):
             state[i] = 0  # it asks for nothing
-        elif abs(over) > AT_BOUND * unit[i] * length:
-            act[i] = 1 if over > 0.0 else -1
+        elif abs(over[i]) > slack * unit[i]:
+            act[i] = 1 if over[i] > 0.0 else -1
             state[i] = HOLDS
     # Householder reflections turn Z so that its first columns are the directions taken.
     Z = Z.copy()
@@ -321,7 +325,12 @@ def _proxqp(
     status = qp.results.info.status
     if status != proxsuite.proxqp.PROXQP_SOLVED:
         raise QPSolverError(f"status {status.name}")
-    return np.array(qp.results.x), np.array(qp.results.z)
+    return np.array(qp.results.x), _settled(np.array(qp.results.z))
+
+
+def _settled(z: np.ndarray) -> np.ndarray:
+    """Duals without those that may be a solver's inaccuracy; an active-set method's need none."""
+    return np.where(np.abs(z) > AT_BOUND * max(1.0, np.abs(z).max(initial=0.0)), z, 0.0)
 
 
 def _daqp(
@@ -365,7 +374,7 @@ def _through_qpsolvers(name: str) -> Backend:
         if len(bounds) and answer.z is not None:
             z[has_upper] += answer.z[: has_upper.sum()]
             z[has_lower] -= answer.z[has_upper.sum() :]
-        return np.asarray(answer.x), z
+        return np.asarray(answer.x), _settled(z)
 
     return solve
 

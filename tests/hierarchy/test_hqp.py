@@ -1,5 +1,6 @@
 """The hierarchy's answers: exact, certified, strict, whatever the solver and the problem."""
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -26,7 +27,7 @@ import hqp_grasp
 from hqp_grasp import HQP, InputError, Level, Projection, Solution, SolverError
 from hqp_grasp.hierarchy import active_set, qp_solvers
 from hqp_grasp.hierarchy import hqp as hqp_module
-from hqp_grasp.hierarchy.hqp import solvers
+from hqp_grasp.hierarchy.hqp import ROUNDS, solvers
 
 INF = np.inf
 # What strictness is promised to: lower levels worsen none above by more than this, relative. As
@@ -315,21 +316,42 @@ def test_a_warm_start_changes_the_way_and_not_the_answer(solver):
             assert_same_point(again.x, cold.x)
 
 
-def test_a_warm_start_from_its_own_answer_needs_one_step(monkeypatch):
-    made = []
-    search = active_set.search
+@pytest.fixture
+def made(monkeypatch):
+    """The steps of each search."""
+    steps, search = [], active_set.search
 
     def counted(*arguments):
         found = search(*arguments)
-        made.append(found[-2])
+        steps.append(found[-2])
         return found
 
     monkeypatch.setattr(active_set, "search", counted)
+    return steps
+
+
+@pytest.mark.parametrize("solver", THREE)
+def test_a_warm_start_from_its_own_answer_needs_one_step(made, solver):
     levels = built(three_level(np.random.default_rng(0), "hard"))
     cold = HQP("active-set").solve(levels)
-    assert (np.abs(cold.active) == 1).any()
-    HQP("active-set").solve(levels, warm=cold)
-    assert made[0] > 1 and made[1:] == [0]
+    assert (np.abs(cold.active) == 1).any() and made.pop() > 1
+    again = HQP(solver).solve(levels, warm=cold)
+    assert made == [0]
+    assert again.method == "active-set" and again.failed == ()
+
+
+@pytest.mark.parametrize("solver", THREE)
+def test_a_warm_start_that_does_not_fit_is_dropped_after_a_few_steps(made, solver):
+    """Steps from there are no shorter than from nothing, and there may be hundreds."""
+    problem = forces(np.random.default_rng(0), 8, 8)
+    cold = solve(problem, solver)
+    misleading = dataclasses.replace(cold, active=np.where(cold.active == 2, 2, 1).astype(np.int8))
+    made.clear()
+    again = HQP(solver).solve(built(problem), warm=misleading)
+    assert made[0] == ROUNDS and len(made) == 2
+    assert again.failed == (f"active-set: not settled from the warm start in {ROUNDS} steps",)
+    assert again.method == solver
+    np.testing.assert_array_equal(again.x, cold.x)
 
 
 def test_a_warm_start_from_another_problem_does_no_harm():

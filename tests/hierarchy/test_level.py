@@ -198,7 +198,7 @@ def test_more_levels_than_the_solution_has_are_refused_by_the_certificate():
 def test_the_search_refuses_an_active_set_of_another_size():
     rows = stack([Level.equal(np.eye(2), [1.0, 2.0])])
     with pytest.raises(InputError, match="an active set must be"):
-        search(rows, np.zeros(5, np.int8), 1, 10, 10)
+        search(rows, np.zeros(5, np.int8), 1, 10, 10, 10)
 
 
 def test_residual_is_the_distance_to_the_nearest_admissible_value():

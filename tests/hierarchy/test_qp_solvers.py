@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from problems import three_level
+from problems import forces, three_level
 
 from hqp_grasp import HQP, Level
 from hqp_grasp.hierarchy.level import stack
@@ -59,6 +59,14 @@ def test_what_no_y_meets_is_no_answer(name):
     both = np.array([[1.0], [1.0]])
     with pytest.raises(QPSolverError, match=r"status|exit flag"):
         BACKENDS[name](np.eye(1), np.zeros(1), both, np.array([-9.0, 2.0]), np.array([1.0, 9.0]))
+
+
+@pytest.mark.parametrize("index", [12, 89, 194, 309, 310, 338, 350])
+def test_rows_that_hold_little_are_told_from_those_that_only_rounding_holds(index):
+    """Contact forces on which one such row was missing, or too many; drawn as by the fuzz."""
+    rng = np.random.default_rng(np.random.SeedSequence([12, index]))
+    answer = HQP("daqp").solve([Level(*rows) for rows in forces(rng)])
+    assert answer.certified and answer.failed == ()
 
 
 def test_objects_of_proxsuite_are_kept_for_32_shapes_and_each_thread_has_its_own():
