@@ -113,11 +113,16 @@ class Outline:
         """Where contacts at s (k,) could go to balance: costs (C,) [m²] and places (C, k) [m].
 
         Two or three unit forces point at equal angles, so that their sum is zero; of more, the
-        angles are the nearest to today's of which that is true. Contacts keep their order around.
+        angles are the nearest to today's of which that is true, contacts keeping their order
+        around, or those of straight pieces, each contact staying on its own or going to one beside.
         What is left of the moment, and the way there, make the cost.
         """
-        shift = summing_to_zero(self.at(s)[0], np.argsort(np.argsort(s)))
-        found = [self._on_arcs(s, shift), self._on_straights(s, shift)]
+        theta = self.at(s)[0]
+        shift = summing_to_zero(theta, np.argsort(np.argsort(s)))
+        straights = np.flatnonzero(self.straight > SHORTEST)
+        around = (self.angle[straights][:, None, None] - shift[:, None] + shift).reshape(-1, len(s))
+        beside = self._beside(theta, self.angle[straights])
+        found = [self._on_arcs(s, shift), self._on_straights(s, np.concatenate([around, beside]))]
         return np.concatenate([v[0] for v in found]), np.concatenate([v[1] for v in found])
 
     def _on_arcs(self, s: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -151,14 +156,27 @@ class Outline:
         moment = A[i] * np.cos(t) + B[i] * np.sin(t)
         return self._cost(s, to, moment)
 
-    def _on_straights(self, s: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Balance with a contact on a straight piece, along which it balances the moment."""
+    def _beside(self, theta: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Angles (C, k) that sum to zero, each of its nearest straight piece, or of one beside."""
+        k = len(theta)
+        if k <= 3 or not len(faces):
+            return np.zeros((0, k))
+        own = np.abs(wrapped(faces - theta[:, None])).argmin(axis=1)
+        choices = np.stack(np.meshgrid(*[(-1, 0, 1)] * k), axis=-1).reshape(-1, k)
+        angles = faces[(own + choices) % len(faces)]
+        zero = np.abs(directions(angles).sum(axis=1)).max(axis=1) < SAME_ANGLE
+        return np.asarray(angles[zero])
+
+    def _on_straights(self, s: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Balance with a contact on a straight piece, along which it balances the moment.
+
+        `theta` (C, k) [rad] are the angles of the normals tried.
+        """
         k = len(s)
         straights = np.flatnonzero(self.straight > SHORTEST)
         arcs = np.flatnonzero(self.straight == 0.0)
-        if not len(straights):
+        if not len(theta):
             return np.zeros(0), np.zeros((0, k))
-        theta = (self.angle[straights][:, None, None] - shift[:, None] + shift).reshape(-1, k)
         off = np.abs(wrapped(theta[..., None] - self.angle[straights]))  # (C, k, straights)
         is_straight = off.min(axis=-1) < SAME_ANGLE
         piece = np.where(is_straight, straights[off.argmin(axis=-1)], self._arc(arcs, theta))
