@@ -178,10 +178,11 @@ def _scores(stack: Stack, grasp: Grasp) -> tuple[float, float]:
     """
     felt, doubtful = 0.0, 0.0
     for task in stack.tasks:
-        if task.goal is not None:
+        goal = task.goal_at(grasp)
+        if goal is not None:
             e, floor = task.error(grasp), task.floor(grasp)
-            felt = max(felt, float(e @ e) / max(task.goal, BEYOND * floor))
-            doubtful = max(doubtful, (float(e @ e) + floor) / task.goal)
+            felt = max(felt, float(e @ e) / max(goal, BEYOND * floor))
+            doubtful = max(doubtful, (float(e @ e) + floor) / goal)
     return felt, doubtful
 
 

@@ -154,7 +154,8 @@ class Target:
         blocks = blocks + self._slopes(task, across)[:, :, None] * across[:, None, :]
         A = blocks.swapaxes(0, 1).reshape(len(e), -1) @ grasp.jacobian
         left = task.error(self.imagined(gain))
-        content = task.goal is not None and left @ left <= task.goal
+        goal = task.goal_at(self.imagined(gain))
+        content = goal is not None and left @ left <= goal
         b = whole if content else whole - (share / gain) * task.gain * left
         return task.weight * A, task.weight * b
 

@@ -32,6 +32,8 @@ COLUMNS = {
     "eps_m": "(N m)^2: squared net moment about the contact centroid",
     "eps_k": "rad: mean angle between flexion velocity and normal",
     "eps_k_eq7": "m/rad: sum of eq. 7 over the contacts",
+    "goal_f": "N^2: eps_f up to which contacts balance: 1e-3 of three, by their number",
+    "goal_m": "(N m)^2: eps_m, likewise: (2e-3)^2 of three, and by their distance beyond 10 cm",
     "friction_demand": "1: least friction coefficient that lets the contacts balance; inf: none",
     "adduction_deg": "deg: the spread joint's angle",
     "elevation_deg": "deg: the palm's approach axis below the horizontal",
@@ -62,7 +64,7 @@ TRUE_COLUMNS = {
 }
 VERDICT_COLUMNS = (  # that verdicts read beside trial, probe and error; the true ones where known
     *("in_contact", "other_links", "limit_violation", "eps_f", "eps_m", "eps_f_true", "eps_m_true"),
-    *("friction_demand", "friction_demand_true"),
+    *("friction_demand", "friction_demand_true", "goal_f", "goal_m"),
 )
 # What these and a study's own columns hold, for whoever reads results: those that all have, and
 # those that some have.
@@ -72,7 +74,7 @@ ALL_HAVE = {
     **{"limit_violation": "numbers", "eps_f": "numbers", "eps_m": "numbers"},
 }
 SOME_HAVE = {name: "numbers" for name in VERDICT_COLUMNS if name not in ALL_HAVE}
-BALANCE_COLUMNS = ("eps_f", "eps_m", "floor_f", "floor_m")
+BALANCE_COLUMNS = ("eps_f", "eps_m", "goal_f", "goal_m", "floor_f", "floor_m")
 # The columns that say the same in every row of a trial.
 TRIAL_COLUMNS = {
     "rejected": "starting postures that did not touch",
@@ -160,13 +162,14 @@ class Record:
         n = np.concatenate([grasp.normals for grasp in self.grasps])
         most, lean, least = _leans(np.unique(n.round(PLACES), axis=0))  # a grasp that is kept, once
         alike = most - least <= ALIKE and least > 0.0
-        if alike and (self.grasps[-1].k * np.sin(least)) ** 2 > CONVERGED_FORCE:
+        end = self.grasps[-1]
+        if alike and (end.k * np.sin(least)) ** 2 > ForceTask().goal_at(end):
             about = np.degrees(lean)
             return f"walls lean by about {about:.0f}°: equal forces cannot balance"
         if self.lost:
             return "the object is not touched at the end"
         force = float(self.rows[-1]["eps_f"])  # type: ignore[arg-type]
-        what = "forces" if force > CONVERGED_FORCE else "moments"
+        what = "forces" if force > ForceTask().goal_at(end) else "moments"
         return f"no grasp was found whose {what} balance"
 
     @property
@@ -220,16 +223,21 @@ class Record:
 def balanced(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Rows (r,) in which the grasp is felt to be balanced, from their BALANCE_COLUMNS.
 
-    ε_f ≤ CONVERGED_FORCE and √ε_m ≤ CONVERGED_MOMENT; where the sensors' noise has a floor, BEYOND
-    times that where it is more: below, nothing can be told from balance.
+    ε_f ≤ goal_f and ε_m ≤ goal_m; where the sensors' noise has a floor, BEYOND times that where it
+    is more: below, nothing can be told from balance. Rows without a goal have that of three
+    contacts.
     """
-    eps_f, eps_m, *floors = (
-        columns[name].astype(float) for name in BALANCE_COLUMNS if name in columns
-    )
-    limits = [np.full(len(eps_f), CONVERGED_FORCE), np.full(len(eps_m), CONVERGED_MOMENT**2)]
-    for limit, floor in zip(limits, floors, strict=False):  # a geometric probe's has none
-        np.fmax(limit, BEYOND * floor, out=limit)
-    return (eps_f <= limits[0]) & (eps_m <= limits[1])  # NaN: not
+    good = np.ones(len(columns["eps_f"]), dtype=bool)
+    for law, goal in (("f", CONVERGED_FORCE), ("m", CONVERGED_MOMENT**2)):
+        eps = columns[f"eps_{law}"].astype(float)
+        limit = np.full(len(eps), goal)
+        if f"goal_{law}" in columns:
+            told = columns[f"goal_{law}"].astype(float)
+            limit = np.where(np.isnan(told), limit, told)
+        if f"floor_{law}" in columns:  # a geometric probe's has none
+            limit = np.fmax(limit, BEYOND * columns[f"floor_{law}"].astype(float))
+        good &= eps <= limit  # NaN: not
+    return good
 
 
 def _leans(normals: np.ndarray) -> np.ndarray:
@@ -299,6 +307,8 @@ def felt_row(
     row = empty_row(robot, stack) | {
         "eps_f": ForceTask().potential(grasp),
         "eps_m": MomentTask().potential(grasp),
+        "goal_f": ForceTask().goal_at(grasp),
+        "goal_m": MomentTask().goal_at(grasp),
         "eps_k": _kinematic(grasp, "angle", np.mean),
         "eps_k_eq7": _kinematic(grasp, "eq7", np.sum),
         "friction_demand": friction_demand(grasp.positions, grasp.normals),
@@ -402,18 +412,26 @@ def _norm(task: Task, grasp: Grasp | None) -> float | None:
 def verdicts(table: pa.Table) -> dict[int, str]:
     """What became of each trial, one of VERDICTS.
 
-    Good: ε_f ≤ CONVERGED_FORCE and √ε_m ≤ CONVERGED_MOMENT (the true ones, where they differ from
-    what was felt) from some probe to the last, no link but the contact points in the object at any
-    probe from 1 on, no violation of a limit, no error.
+    Good: ε_f ≤ goal_f and ε_m ≤ goal_m (the true ones, where they differ from what was felt) from
+    some probe to the last, no link but the contact points in the object at any probe from 1 on, no
+    violation of a limit, no error.
     """
     rows = in_order(table)
     begin, last = ends(rows)
-    force, moment = (known(rows, name)[last] for name in ("eps_f", "eps_m"))
     error, lost, link, violation = _faults(rows, begin, last)
-    unbalanced = ~((force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2))
+    unbalanced = ~truly_balanced(rows)[last]
     gravest = np.select((error, lost, unbalanced, link, violation), range(1, len(VERDICTS)), 0)
     trial = rows["trial"].to_numpy()[begin]
     return {int(i): VERDICTS[kind] for i, kind in zip(trial, gravest, strict=True)}
+
+
+def truly_balanced(table: pa.Table) -> np.ndarray:
+    """Rows (r,) in which the grasp, as it is where that differs from what was felt, balances."""
+    columns = {name: known(table, name) for name in ("eps_f", "eps_m")}
+    for name in ("goal_f", "goal_m"):
+        if name in table.column_names:
+            columns[name] = floats(table, name)
+    return balanced(columns)
 
 
 def secures(table: pa.Table, demand: float = SECURE) -> dict[int, bool]:

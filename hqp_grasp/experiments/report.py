@@ -15,8 +15,6 @@ from hqp_grasp.errors import InputError, ResultsError
 from hqp_grasp.experiments.parts import read_results
 from hqp_grasp.experiments.record import (
     ALL_HAVE,
-    CONVERGED_FORCE,
-    CONVERGED_MOMENT,
     SOME_HAVE,
     VERDICTS,
     ends,
@@ -24,6 +22,7 @@ from hqp_grasp.experiments.record import (
     in_order,
     known,
     secures,
+    truly_balanced,
     verdicts,
 )
 from hqp_grasp.mechanics import SECURE
@@ -61,11 +60,10 @@ def outcomes(folder: str | Path) -> list[Outcome]:
     if "friction_demand" in table.column_names:
         secure, demand = secures(table), known(table, "friction_demand")
     trial, seed = (table[name].to_numpy() for name in ("trial", "seed"))
-    force, moment = (known(table, name) for name in ("eps_f", "eps_m"))
     adduction = floats(table, "adduction_deg")
     begin, end = ends(table)
     row = np.arange(len(trial))
-    balanced = (force <= CONVERGED_FORCE) & (moment <= CONVERGED_MOMENT**2)  # NaN: not
+    balanced = truly_balanced(table)
     touch = np.maximum.reduceat(np.where(table["in_contact"].to_numpy(), row, -1), begin)
     holding = demand <= SECURE
     found = np.minimum.reduceat(np.where(holding, row, len(row)), begin)

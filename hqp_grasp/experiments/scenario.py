@@ -46,7 +46,7 @@ from hqp_grasp.world.scene import Scene
 # What the table on screen and the figure are made of.
 COLUMNS = (
     *("trial", "probe", "rejected", "error", "unbalanced"),
-    *("eps_f", "eps_m", "eps_k", "friction_demand", "adduction_deg"),
+    *("eps_f", "eps_m", "goal_f", "goal_m", "eps_k", "friction_demand", "adduction_deg"),
     *("elevation_deg", "in_contact", "other_links", "in_transit", "step_share"),
     *("limit_active", "limit_violation", "hqp_projection_gap", "method"),
 )
@@ -279,10 +279,17 @@ def summary(table: pa.Table) -> str:
             else:
                 cells.append(f"{form.format(np.median(picked))} (≤ {form.format(picked.max())})")
         lines.append(f"{label:22}{cells[0]:>22}{cells[1]:>22}")
+    force_goal, moment_goal = (
+        values[np.isfinite(values)][-1] if np.isfinite(values).any() else usual
+        for values, usual in (
+            (shaped["goal_f"].astype(float), CONVERGED_FORCE),
+            (np.sqrt(shaped["goal_m"].astype(float)), CONVERGED_MOMENT),
+        )
+    )
     after = f", after {np.median(first):g} probes (worst {first.max()})" if len(first) else ""
     lines.append(
         f"\nconverged{converged.sum():6} of {trials}{after}: "
-        f"ε_f ≤ {CONVERGED_FORCE:g} N², √ε_m ≤ {1e3 * CONVERGED_MOMENT:g} mm·N, kept to the end"
+        f"ε_f ≤ {force_goal:g} N², √ε_m ≤ {1e3 * moment_goal:.3g} mm·N, kept to the end"
         + (f", or {BEYOND:g} × the floor" if "floor_f" in columns else "")
     )
     lines += _physical(columns, shaped)

@@ -21,7 +21,7 @@ class ForceTask(ContactSpaceTask):
     """
 
     radius: float = 0.05  # r [m], of the sphere each contact is taken to move on
-    goal: ClassVar[float] = 1e-3  # [N²]
+    goal: ClassVar[float] = 1e-3  # [N²] of three contacts
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -30,6 +30,10 @@ class ForceTask(ContactSpaceTask):
     def error(self, grasp: Grasp) -> np.ndarray:
         """Net force f = −Σ n_i (3,) [N], world."""
         return -grasp.normals.sum(axis=0)
+
+    def goal_at(self, grasp: Grasp) -> float:
+        """ε_f [N²] that is the same share of all contact forces as `goal` is of three."""
+        return self.goal * (grasp.k / 3.0) ** 2
 
     def floor(self, grasp: Grasp) -> float:
         """ε_f [N²] that noise makes of a balanced grasp, on average."""

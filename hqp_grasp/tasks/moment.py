@@ -17,6 +17,8 @@ from hqp_grasp.tasks.contact_space import (
     tangent_projectors,
 )
 
+HAND = 0.1  # [m] of contacts from their centroid, on average, within which one hand grasps
+
 
 @dataclass(frozen=True)
 class MomentTask(ContactSpaceTask):
@@ -27,7 +29,7 @@ class MomentTask(ContactSpaceTask):
     """
 
     reference: str | ArrayLike = "centroid"  # c: the contacts' mean, or a point (3,) [m], world
-    goal: ClassVar[float] = (2e-3) ** 2  # [(N·m)²]
+    goal: ClassVar[float] = (2e-3) ** 2  # [(N·m)²] of three contacts within HAND
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -44,6 +46,14 @@ class MomentTask(ContactSpaceTask):
         c = x.sum(axis=0) / grasp.k if isinstance(self.reference, str) else np.array(self.reference)
         moments = cross_matrices(grasp.normals) @ (x - c)[:, :, None]
         return moments.sum(axis=0)[:, 0]
+
+    def goal_at(self, grasp: Grasp) -> float:
+        """ε_m [(N·m)²]: `goal` by the number of contacts, and by how far they lie beyond HAND.
+
+        What friction has to make good is the moment by the contacts' forces and distances.
+        """
+        far = np.linalg.norm(grasp.positions - grasp.positions.mean(axis=0), axis=1).mean()
+        return self.goal * (grasp.k / 3.0 * max(1.0, float(far) / HAND)) ** 2
 
     def floor(self, grasp: Grasp) -> float:
         """ε_m [(N·m)²] that noise makes of a balanced grasp, on average."""

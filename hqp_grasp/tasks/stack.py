@@ -57,6 +57,10 @@ class Task(ABC):
         """Of the error; "rad" where it compares with joint motions as it is."""
         return ""
 
+    def goal_at(self, grasp: Grasp) -> float | None:
+        """eᵀe with which the law is content at this grasp: `goal`, unless contacts change it."""
+        return self.goal
+
     def floor(self, grasp: Grasp) -> float:
         """What noise of the contacts makes of eᵀe where it vanishes, on average."""
         return 0.0
