@@ -11,8 +11,9 @@ from scipy.special import chdtri
 
 from hqp_grasp.grasp import Grasp, Touch
 from hqp_grasp.mechanics import tangents
-from hqp_grasp.surface.felt import LEAST_NOISE, contradicted
+from hqp_grasp.surface.felt import contradicted
 
+LEAST_NOISE = 1e-6  # [rad] of normals that are known
 KNOWN = 2e-5 * 5.0 ** np.arange(4)  # [m] to which tips' centres may be known, the best first
 UNLIKELY = 0.01  # of a misfit, or centres are taken to be known less
 STEPS = 40  # of Newton's method; five to fifteen are usual

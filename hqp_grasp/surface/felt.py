@@ -14,7 +14,6 @@ from hqp_grasp.grasp import Grasp, Touch
 CONTRADICTION = 2e-4  # [m] a point may lie beyond the tangent plane of another
 SLACK = 2e-6  # [m] rounding of what was felt
 SURE = 2.5  # standard errors within which noise explains what was felt
-LEAST_NOISE = 1e-6  # [rad]
 SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
 UNDECIDED = 1e-5  # [–] mean squares of normals along a direction, below which tips decide
 LEANING = 0.3  # [–] part of a normal along the axis, above which it is of an end face or its rim
