@@ -146,7 +146,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,physics-speed,benchmarks/physics.py speed)
 	$(call keep,prisms,benchmarks/polygons.py --shapes box_6 box_8 box_10 triangle pentagon octagon --starts 80)
 	$(call keep,leaning,benchmarks/leaning.py --starts 20 --seed 71)
-	$(call keep,noise,benchmarks/noise.py --trials 100 --seed 50)
+	$(call keep,noise,benchmarks/noise.py --trials 80 --seed 62)
 	$(call keep,polygons,benchmarks/polygons.py --polygons 20 --starts 50 --seed 0)
 	$(call keep,caps,benchmarks/caps.py --trials 200 --seed 90)
 	$(call keep,probing,benchmarks/probing.py)
