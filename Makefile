@@ -164,6 +164,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,edges,benchmarks/edges.py)
 	$(call keep,cluster,benchmarks/cluster.py)
 	$(call keep,cluster-large,benchmarks/cluster.py --kills 0 --rounds 0 --large 10000)
+	$(call keep,cycle,benchmarks/cycle.py)
 	$(call keep,where-time-goes,benchmarks/where_time_goes.py --problems 1000)
 	$(call keep,solvers,benchmarks/solvers.py)
 	$(call keep,solvers-sizes,benchmarks/solvers.py --sizes --problems 150 --checked 2 --plot docs/images/solvers.png)

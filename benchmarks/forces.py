@@ -8,8 +8,9 @@ degree or so: the warm start comes from the grasp as it was. All solve the same 
 the other, so that whatever else the machine does meets all alike:
 
     hierarchy cold         hg.Grip's levels, certified; daqp finds the active rows
-    hierarchy warm         the same by the active-set search, from the answer before the turn
-    active-set cold        the same search from nothing
+    hierarchy warm         the same, from the answer before the turn
+    active-set cold        the compiled search by itself, from nothing
+    proxqp cold            proxqp instead of daqp
     weighted QP            daqp: torques, pyramids and normal forces are constraints, the other laws
                            one cost, each level weighing 10 times what the next one does
     cone program           clarabel: the same cost and limits, with round cones for pyramids
@@ -124,7 +125,7 @@ def conic(levels: list[hg.Level], felt: Felt) -> Callable[[], np.ndarray | None]
     return solve
 
 
-def main(problems: int = 200, contacts: tuple[int, ...] = (3, 8), seed: int = 0) -> None:
+def main(problems: int = 200, contacts: tuple[int, ...] = (3, 6, 8, 12), seed: int = 0) -> None:
     """Print times and what each way finds.
 
     Args:
@@ -134,7 +135,7 @@ def main(problems: int = 200, contacts: tuple[int, ...] = (3, 8), seed: int = 0)
     """
     robot = hg.Scene(robot="wam_bhand").articulated
     grip = hg.Grip(robot)
-    search = hg.HQP("active-set")
+    search, proxqp = hg.HQP("active-set"), hg.HQP("proxqp")
     for k in contacts:
         rng = np.random.default_rng([seed, k])
         demand: list[float] = []
@@ -156,8 +157,9 @@ def main(problems: int = 200, contacts: tuple[int, ...] = (3, 8), seed: int = 0)
 
             ways = {
                 "hierarchy cold": lambda: certified(grip.hqp, None),
-                "hierarchy warm": lambda before=before: certified(search, before),
+                "hierarchy warm": lambda before=before: certified(grip.hqp, before),
                 "active-set cold": lambda: certified(search, None),
+                "proxqp cold": lambda: certified(proxqp, None),
                 "weighted QP": weighted(levels),
                 "cone program": conic(levels, felt),
             }
