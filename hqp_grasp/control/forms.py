@@ -169,8 +169,10 @@ class HierarchyForm(Form):
         early = len(episode.touches) <= EARLY and not episode.missed
         if early and _fingers_lean(stack, grasp) and not why_not(stack):
             return PaperHierarchyForm(self.hqp).plan(stack, episode)
-        felt = Felt.of(episode.touches, 2.0 * self.size)
-        surface = self.surface or believed(felt, grasp, self.size)
+        apart = np.linalg.norm(grasp.positions - grasp.positions.mean(axis=0), axis=1).mean()
+        size = max(self.size, float(apart))
+        felt = Felt.of(episode.touches, 2.0 * size)
+        surface = self.surface or believed(felt, grasp, size)
         targets = Target.each(surface, stack, grasp)
         if not targets:
             return None
