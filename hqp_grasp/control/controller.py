@@ -17,16 +17,13 @@ from hqp_grasp.control.limits import (
     RetreatLimit,
     StepLimit,
 )
-from hqp_grasp.control.step import Plan
+from hqp_grasp.control.reach import carried
+from hqp_grasp.control.step import ROUNDING, Plan
 from hqp_grasp.errors import HqpGraspError, InputError, flag, instance, whole
 from hqp_grasp.grasp import Grasp, Missed, Touch
 from hqp_grasp.hierarchy.level import Solution
 from hqp_grasp.tasks import Priority, Stack, Task
 from hqp_grasp.world.robot import Robot
-
-SEARCH_STEPS = 3  # of Newton's method, to get beside a first touch
-SEARCH_RANK = 1e-3  # [–] of the palm's Jacobian, below which an arm cannot go there
-CLIP_TOLERANCE = 1e-9  # [rad] a solver's rounding may leave a range by; more is a bug
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +42,7 @@ class Step:
         return None if self.plan is None else self.plan.solution
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Controller:
     """Laws within limits, as a rule for the next touch: no scene and no probe are needed.
 
@@ -65,30 +62,42 @@ class Controller:
     """
 
     robot: Robot
-    stack: Stack | Task
-    form: str | Form = "hierarchy"
-    budget: int | None = None  # touches in all, the first included
-    landing: bool = True  # correct each step by the hand's kinematics, see `land`
+    stack: Stack  # within limits of its own or the defaults
+    form: Form
+    budget: int | None  # touches in all, the first included
+    landing: bool  # correct each step by the hand's kinematics, see `land`
 
-    def __post_init__(self) -> None:
-        instance("Controller.robot, such as Scene().articulated,", self.robot, Robot)
-        if self.budget is not None:
-            object.__setattr__(self, "budget", whole("Controller.budget", self.budget, 1))
-        stack = Stack.of(self.stack).on(self.robot.model)
+    def __init__(
+        self,
+        robot: Robot,
+        stack: Stack | Task,
+        form: str | Form = "hierarchy",
+        budget: int | None = None,
+        landing: bool = True,
+    ) -> None:
+        instance("Controller.robot, such as Scene().articulated,", robot, Robot)
+        budget = None if budget is None else whole("Controller.budget", budget, 1)
+        stack = Stack.of(stack).on(robot.model)
         if not any(limit.priority is Priority.CAP for limit in stack.limits):
             stack = stack.within(StepLimit())
         if not any(limit.priority is Priority.RANGE for limit in stack.limits):
-            stack = stack.within(ConfigurationLimit(self.robot))
-        if self.robot.idle.any() and not any(isinstance(v, HoldLimit) for v in stack.limits):
-            stack = stack.within(HoldLimit(self.robot))
+            stack = stack.within(ConfigurationLimit(robot))
+        if robot.idle.any() and not any(isinstance(v, HoldLimit) for v in stack.limits):
+            stack = stack.within(HoldLimit(robot))
         watched = any(isinstance(v, ClearanceLimit) for v in stack.limits)
-        if self.robot.description.clearance > 0.0 and not watched:
-            stack = stack.within(ClearanceLimit(self.robot))
-        object.__setattr__(self, "stack", stack)
-        if not isinstance(self.form, Form):
-            object.__setattr__(self, "form", form_of(self.form))
-        self.form.check(stack)  # type: ignore[union-attr]
-        object.__setattr__(self, "landing", flag("Controller.landing", self.landing))
+        if robot.description.clearance > 0.0 and not watched:
+            stack = stack.within(ClearanceLimit(robot))
+        form = form if isinstance(form, Form) else form_of(form)
+        form.check(stack)
+        landing = flag("Controller.landing", landing)
+        for name, value in {
+            "robot": robot,
+            "stack": stack,
+            "form": form,
+            "budget": budget,
+            "landing": landing,
+        }.items():
+            object.__setattr__(self, name, value)
 
     def step(self, history: Sequence[Touch]) -> Step:
         """Return where to touch next, given every touch so far, hits and misses, in order.
@@ -97,8 +106,7 @@ class Controller:
         """
         if len(history):
             self._require_own(history)
-        form: Form = self.form  # type: ignore[assignment]
-        policy = form.misses
+        policy = self.form.misses
         episode = Episode.of(history, policy, self.budget, self.robot)
         grasp, misses = episode.grasp, episode.misses
         if episode.left is not None and episode.left <= 0:
@@ -110,10 +118,9 @@ class Controller:
             why = f"{last.reason.value} ({last.where})"
             return Step(None, reason=f"{len(misses)} misses from one grasp, the last: {why}")
         short = policy.shorter(misses)
-        stack: Stack = self.stack  # type: ignore[assignment]
         back = self._withdrawals(policy, misses)
-        stack = stack.within(*(RetreatLimit(self.robot, far, g) for g, far in back.items()))
-        plan = form.plan(stack, episode)
+        stack = self.stack.within(*(RetreatLimit(self.robot, far, g) for g, far in back.items()))
+        plan = self.form.plan(stack, episode)
         share = policy.shares[short]
         x = (1.0 if plan.exact else share) * plan.x
         if self.landing and not plan.exact:
@@ -150,17 +157,16 @@ class Controller:
             return Step(q, reason="the same again")
         if way is None or not self.robot.arm:
             return Step(None, reason="no touch has felt a grasp: begin where the hand touches")
-        goal = self.robot.palm(q)[0] + way
-        for _ in range(SEARCH_STEPS):
-            rest = np.append(goal - self.robot.palm(q)[0], np.zeros(3))
-            q = q + np.linalg.pinv(self.robot.palm_jacobian(q), rcond=SEARCH_RANK) @ rest
-            q = np.clip(q, *self._ranges)
+        postures = carried(self.robot, np.clip(q, *self._ranges), way)
+        if postures is None:
+            return Step(q, reason="the same again: the arm cannot go beside")
+        q = np.clip(postures[-1], *self._ranges)
         return Step(q, reason=f"{1e3 * np.linalg.norm(way):g} mm beside")
 
     @property
     def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
         """The joints' ranges (n,) [rad], lower and upper, the narrowest of all limits."""
-        limits = self.stack.limits  # type: ignore[union-attr]
+        limits = self.stack.limits
         robots = [self.robot, *(v.robot for v in limits if isinstance(v, ConfigurationLimit))]
         lower = np.max([robot.q_lower for robot in robots], axis=0)
         return lower, np.min([robot.q_upper for robot in robots], axis=0)
@@ -199,7 +205,7 @@ class Controller:
         q = grasp.q + x
         lower, upper = self._ranges
         clipped = np.clip(q, lower, upper)
-        left = np.abs(clipped - q) > CLIP_TOLERANCE
+        left = np.abs(clipped - q) > ROUNDING
         started_inside = (grasp.q >= lower) & (grasp.q <= upper)
         if (left & started_inside).any():
             worst = np.abs(clipped - q).max()

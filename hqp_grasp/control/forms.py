@@ -24,7 +24,7 @@ from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.surface.believed import believed
 from hqp_grasp.surface.felt import Felt
 from hqp_grasp.surface.surface import Surface
-from hqp_grasp.tasks import Priority, Stack
+from hqp_grasp.tasks import ForceTask, Priority, Stack
 from hqp_grasp.tasks.contact_space import in_contact_space
 from hqp_grasp.tasks.kinematic import is_kinematic
 
@@ -170,9 +170,8 @@ class HierarchyForm(Form):
         if early and _fingers_lean(stack, grasp) and not why_not(stack):
             return PaperHierarchyForm(self.hqp).plan(stack, episode)
         apart = np.linalg.norm(grasp.positions - grasp.positions.mean(axis=0), axis=1).mean()
-        size = max(self.size, float(apart))
-        felt = Felt.of(episode.touches, 2.0 * size)
-        surface = self.surface or believed(felt, grasp, size)
+        felt = Felt.of(episode.touches, 2.0 * max(self.size, float(apart)))
+        surface = self.surface or believed(felt, grasp, ForceTask().goal_at(grasp))
         targets = Target.each(surface, stack, grasp)
         if not targets:
             return None

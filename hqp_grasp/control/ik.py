@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import mink
@@ -133,12 +133,9 @@ def _rows(
 
 
 def _listed(values: object, argument: str) -> list[Any]:
-    try:
-        return list(values)  # type: ignore[call-overload]
-    except TypeError as error:
-        raise InputError(
-            f"{argument} must be a list, even of one; got {type(values).__name__}"
-        ) from error
+    if not isinstance(values, Iterable):
+        raise InputError(f"{argument} must be a list, even of one; got {type(values).__name__}")
+    return list(values)
 
 
 def _require(value: object, kind: type, argument: str) -> None:

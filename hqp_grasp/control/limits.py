@@ -87,7 +87,7 @@ class ConfigurationLimit(Limit):
             raise InputError(
                 f"the grasp has {len(q)} joints, {self.robot.description.name} {len(lower)}"
             )
-        A = grasp.coupling[limited]  # type: ignore[index]
+        A = np.asarray(grasp.coupling)[limited]
         return Level(A, (lower - q)[limited], (upper - q)[limited], "range")
 
 

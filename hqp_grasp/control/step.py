@@ -15,7 +15,7 @@ from hqp_grasp.hierarchy.level import Level, Solution
 from hqp_grasp.hierarchy.projection import Projection
 from hqp_grasp.tasks import Stack
 
-CAP_TOLERANCE = 1e-9  # [–] over a cap
+ROUNDING = 1e-9  # [–, rad] of a solver, over a cap or a range; more is a bug
 SHORTENINGS = 3  # of what is asked, until its step fits the caps
 
 
@@ -77,7 +77,7 @@ def _shared(
         levels = asked(share)
         x = projection.solve(levels).x
         ratio = cap_ratio(x, stack, grasp)
-        if ratio <= 1.0 + CAP_TOLERANCE:
+        if ratio <= 1.0 + ROUNDING:
             break
         share /= ratio
     return levels, x, share < gain

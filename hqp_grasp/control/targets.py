@@ -12,7 +12,7 @@ from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.mechanics import tangents
-from hqp_grasp.surface.surface import Surface, Way, spread
+from hqp_grasp.surface.surface import Surface, Way, spread, unit
 from hqp_grasp.tasks import ContactSpaceTask, Priority, Stack, Task
 from hqp_grasp.tasks.contact_space import in_contact_space
 from hqp_grasp.world.clearance import link_balls
@@ -145,7 +145,7 @@ class Target:
         far = np.linalg.norm(motion, axis=1)
         moves = (far > STILL)[:, None]
         along = np.where(moves, motion / np.maximum(far, STILL)[:, None], first)
-        across = _unit(np.cross(grasp.normals, along))
+        across = unit(np.cross(grasp.normals, along))
         change = np.array([task.error(self.imagined(share, i)) - e for i in range(grasp.k)])
         whole = task.error(self.imagined(share)) - e
         change[moves[:, 0]] += (whole - change.sum(axis=0)) / max(int(moves.sum()), 1)
@@ -164,7 +164,7 @@ class Target:
         turned = (self._turn @ d[:, :, None])[:, :, 0]
         sides = []
         for h in (STEP, -STEP):
-            c, n = self.grasp.centers + h * d, _unit(self.grasp.normals + h * turned)
+            c, n = self.grasp.centers + h * d, unit(self.grasp.normals + h * turned)
             moved = [self._moved(c, n, [i]) for i in range(self.grasp.k)]
             sides.append(np.array([task.error(grasp) for grasp in moved]))
         return (sides[0] - sides[1]) / (2.0 * STEP)
@@ -172,10 +172,6 @@ class Target:
     @cached_property
     def _turn(self) -> np.ndarray:
         return self.surface.turn(self.grasp)
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return np.asarray(v / np.linalg.norm(v, axis=1)[:, None])
 
 
 def nearest_free(targets: Sequence[Target], robot: Robot, gain: float) -> Target:

@@ -97,30 +97,23 @@ def doubt(x: np.ndarray, noise: np.ndarray, tip: np.ndarray) -> np.ndarray:
     return np.asarray(SURE * noise[:, None] * (far + tip[:, None]))
 
 
+def gaps(
+    x: np.ndarray, n: np.ndarray, noise: np.ndarray, tip: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far [m] point j is behind plane k at most, n_k·n_j, and whether they tell a curvature.
+
+    Each is (N, N) [k, j]. Normals that noise or rounding makes of one say nothing of it.
+    """
+    cosine = n @ n.T
+    behind = np.maximum((n * x).sum(axis=1)[:, None] - n @ x.T, 0.0)
+    same = SAME_NORMAL + 0.5 * SURE**2 * (noise[:, None] + noise) ** 2
+    return behind + SLACK + doubt(x, noise, tip), cosine, 1.0 - cosine > same
+
+
 def balls(
     x: np.ndarray, n: np.ndarray, noise: np.ndarray, tip: np.ndarray, widest: float
 ) -> np.ndarray:
     """Radii (N,) [m] of the largest balls behind all planes, but for what noise may have lifted."""
-    slack, same = SLACK + doubt(x, noise, tip), 0.5 * SURE**2 * (noise[:, None] + noise) ** 2
-    return largest_balls(x, n, x, n, widest, slack, SAME_NORMAL + same)
-
-
-def largest_balls(
-    x: np.ndarray,
-    n: np.ndarray,
-    at: np.ndarray,
-    normal: np.ndarray,
-    widest: float,
-    slack: np.ndarray | float = SLACK,
-    same: np.ndarray | float = SAME_NORMAL,
-) -> np.ndarray:
-    """Radii (N,) [m] of balls that touch at x from inside, n being the outward normal there.
-
-    They are the largest that stay behind the planes through `at` (M, d) with outward `normal`,
-    but for `slack` (M, N) [m]; planes whose normal differs by 1 − n·n' ≤ `same` tell nothing.
-    """
-    turn = 1.0 - normal @ n.T
-    gap = (normal * at).sum(axis=1)[:, None] - normal @ x.T  # [k, j] of point j behind plane k
-    tells = turn > same
-    bound = np.where(tells, (np.maximum(gap, 0.0) + slack) / np.where(tells, turn, 1.0), widest)
+    gap, cosine, tells = gaps(x, n, noise, tip)
+    bound = np.where(tells, gap / np.where(tells, 1.0 - cosine, 1.0), widest)
     return np.asarray(bound.min(axis=0, initial=widest))

@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hqp_grasp.surface.supported import MOMENT_WORTH, zero_sum
+
 DIRECTIONS = 720  # in which the hull of discs is looked up
 FIRST_WINS = 1e-8  # [m] by which a later disc must stick out to count
 SHORTEST = 5e-4  # [m] of a straight piece along which contacts may be moved
 SAME_ANGLE = 1e-4  # [rad] straight pieces nearer than this to an angle have it
-GRID = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)  # [rad] where balance is tried at least
-NEWTON = 10  # steps, from angles to those nearest that sum to zero
-FLATTEST = 1e-3  # [–] of normals, below which turning them leaves their sum as it is
-MOMENT_WORTH = 50.0  # [–] m of way for which 1 N·m per N of moment left is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +116,8 @@ class Outline:
         What is left of the moment, and the way there, make the cost.
         """
         theta = self.at(s)[0]
-        shift = summing_to_zero(theta, np.argsort(np.argsort(s)))
+        order, shift = np.argsort(s), np.empty(len(s))
+        shift[order] = _zero_sum(theta[order])
         straights = np.flatnonzero(self.straight > SHORTEST)
         around = (self.angle[straights][:, None, None] - shift[:, None] + shift).reshape(-1, len(s))
         beside = self._beside(theta, self.angle[straights])
@@ -132,7 +131,7 @@ class Outline:
         = A cos θ + B sin θ: its zeros there, and the middle, are tried.
         """
         arcs = np.flatnonzero(self.straight == 0.0)
-        cuts = np.append((self.angle[arcs][:, None] - shift).ravel(), GRID)
+        cuts = (self.angle[arcs][:, None] - shift).ravel()
         cuts = np.sort(cuts % (2.0 * np.pi))
         ends = np.append(cuts[1:], cuts[0] + 2.0 * np.pi)
         middle = 0.5 * (cuts + ends)
@@ -213,24 +212,16 @@ class Outline:
         return np.asarray(arcs[np.searchsorted(self.angle[arcs] - first, turn, side="right") - 1])
 
 
-def summing_to_zero(theta: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Angles (k,) [rad] of unit vectors that sum to zero, near those given, in that order around.
+def _zero_sum(theta: np.ndarray) -> np.ndarray:
+    """Angles (k,) [rad] of unit vectors that sum to zero, near those given, in their order around.
 
-    The first in the order is at 0. Equal angles where Newton's method leads to none else.
+    Equal angles where none are near.
     """
-    k = len(theta)
-    equal = 2.0 * np.pi / k * place
-    if k <= 3:
-        return equal
-    first = int(place.argmin())
-    t = (theta - theta[first]) % (2.0 * np.pi)
-    for _ in range(NEWTON):
-        n = directions(t)
-        across = np.column_stack([-n[:, 1], n[:, 0]])
-        t = t - np.linalg.pinv(across.T, rcond=FLATTEST) @ n.sum(axis=0)
-    t = t - t[first]
-    ordered = (np.diff(t[np.argsort(place)]) > -SAME_ANGLE).all()  # those on one face are equal
-    return t if ordered and np.abs(directions(t).sum(axis=0)).max() < SAME_ANGLE else equal
+    e = zero_sum(np.column_stack([directions(theta), np.zeros(len(theta))]))
+    angle = np.arctan2(e[:, 1], e[:, 0])
+    if np.abs(directions(angle).sum(axis=0)).max() > SAME_ANGLE:
+        angle = 2.0 * np.pi / len(theta) * np.arange(len(theta))
+    return np.asarray(angle)
 
 
 def directions(theta: np.ndarray) -> np.ndarray:

@@ -8,14 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hqp_grasp.mechanics import tangents
-from hqp_grasp.surface.felt import SURE, Felt, doubt
+from hqp_grasp.surface.felt import SLACK, Felt, gaps
 from hqp_grasp.surface.supported import Supported
 
 SOFTNESS = (1e-3, 2e-4, 2e-5)  # [m] by which the hull's edges are rounded, ever less
-ROUNDING = 2e-6  # [m] of what was felt
-LONGEST = 0.1  # [m] semi-axis of an ellipsoid
 NEGLECTED = 16.0  # [–] times the softness that a body's support is less than the hull's
-SAME_NORMAL = 2e-4  # [–] 1 − n·n' below which two normals (1.1° apart) tell nothing of curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,36 +35,14 @@ class Rounded(Supported):
     softness: float = SOFTNESS[-1]  # [m]
 
     @classmethod
-    def of(cls, felt: Felt, size: float) -> Rounded:
-        """The surface of what was felt; `size` [m] is the object's radius, where nothing tells."""
-        same = 0.5 * SURE**2 * (felt.noise[:, None] + felt.noise) ** 2
-        slack = doubt(felt.positions, felt.noise, felt.tip_radii)
-        return cls.behind(felt.positions, felt.normals, size, slack, same)
-
-    @classmethod
-    def behind(
-        cls,
-        x: np.ndarray,
-        n: np.ndarray,
-        radius: float = 0.05,
-        slack: np.ndarray | float = 0.0,
-        same: np.ndarray | float = 0.0,
-    ) -> Rounded:
-        """The surface through x (N, 3) [m] with outward normals n (N, 3), world.
-
-        `radius` [m] is that of curvature where nothing felt tells it. Noise may have lifted point j
-        over plane k by `slack` (N, N) [m] [k, j], and two normals tell nothing where 1 − n·n' is
-        less than `same` (N, N) [–].
-        """
-        cosine = n @ n.T
-        gap = np.maximum((n * x).sum(axis=1)[:, None] - n @ x.T, 0.0) + slack + ROUNDING
-        tells = 1.0 - cosine > SAME_NORMAL + same
-        b = np.where(tells, gap / np.where(tells, 1.0 - cosine, 1.0), 2.0 * radius).min(axis=0)
-        b = np.minimum(b, 2.0 * radius)
+    def of(cls, felt: Felt) -> Rounded:
+        """The surface of what was felt."""
+        x, n, b = felt.positions, felt.normals, felt.radii
+        gap, cosine, tells = gaps(x, n, felt.noise, felt.tip_radii)
         far = np.linalg.norm(x - x[:, None], axis=-1)
-        flat = np.where(tells, 0.0, far).max(axis=0)
-        longest = np.minimum(np.maximum(np.sqrt(b * radius), 2.0 * flat), LONGEST)
-        M = _stretched(n, b, gap, cosine, tells, np.maximum(longest, b))
+        flat = np.where(tells, 0.0, far).max(axis=0)  # to the farthest point of the same face
+        longest = np.clip(np.maximum(np.sqrt(0.5 * b * felt.widest), 2.0 * flat), b, felt.widest)
+        M = _stretched(n, b, gap, cosine, tells, longest)
         Q = M + (b * b)[:, None, None] * n[:, :, None] * n[:, None, :]
         return cls(x, x - b[:, None] * n, Q)
 
@@ -116,7 +91,7 @@ def _stretched(
     points at 1/longest bound it where planes do not.
     """
     T = tangents(n)  # (N, 2, 3)
-    bound = np.sqrt(np.maximum(gap * (gap + 2.0 * b * cosine), ROUNDING**2))
+    bound = np.sqrt(np.maximum(gap * (gap + 2.0 * b * cosine), SLACK**2))
     p = np.einsum("jai,ki->jka", T, n) / bound.T[..., None]
     p = np.where(tells.T[..., None], p, 0.0)
     angle = 0.25 * np.pi * np.arange(4)

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hqp_grasp.grasp import Grasp
+from hqp_grasp.surface.surface import APART, DISTINCT, distinct, unit
 
 STARTS = (300, 24)  # rotations from which balance is sought: anywhere, and near the grasp
 DOUBT_WORTH = 0.5  # [–] m of way for which 1 m from what was felt is taken
 MOMENT_WORTH = 50.0  # [–] m of way for which 1 N·m per N of moment left is taken
-DISTINCT = (10, 0.01)  # ways at most; [m] by which the place of a contact differs between two
 
 
 class Supported(ABC):
@@ -37,7 +37,7 @@ class Supported(ABC):
         """
         step, bend = 1e-5, np.zeros((len(u), 3, 3))  # [rad]
         for j in range(3):
-            ahead, behind = (_unit(u + sign * step * np.eye(3)[j]) for sign in (1.0, -1.0))
+            ahead, behind = (unit(u + sign * step * np.eye(3)[j]) for sign in (1.0, -1.0))
             bend[:, :, j] = (self.support(ahead) - self.support(behind)) / (2.0 * step)
         return self.support(u), bend
 
@@ -73,10 +73,10 @@ class Supported(ABC):
         for surface in (*self.smoother(), self):
             R = _balanced(surface, R, e)
             cost, centers = _costs(surface, grasp, R @ e.T)
-            order = _distinct(cost, centers, 4 * DISTINCT[0], 0.1 * DISTINCT[1])
+            order = distinct(cost, centers, 4 * DISTINCT, 0.1 * APART)
             R = R[order]
         cost, centers = _costs(self, grasp, R @ e.T)
-        order = _distinct(cost, centers, *DISTINCT)
+        order = distinct(cost, centers)
         return [WayOver.over(self, grasp, (R[i] @ e.T).T, float(cost[i])) for i in order]
 
 
@@ -104,7 +104,7 @@ class WayOver:
         normals = np.cos(t)[..., None] * n[:, None] + np.sin(t)[..., None] * aside[:, None]
         rho = np.array([c.tip_radius for c in grasp.contacts])[:, None, None]
         centers = surface.support(normals.reshape(-1, 3)).reshape(k, -1, 3) + rho * normals
-        centers[:, 0] = _centers(grasp)
+        centers[:, 0] = grasp.centers
         far = np.linalg.norm(np.diff(centers, axis=1), axis=-1)
         done = np.cumsum(far, axis=1)
         done = np.concatenate([np.zeros((k, 1)), done], axis=1)
@@ -121,7 +121,7 @@ class WayOver:
                 for length, place in zip(self.length, places, strict=True)
             ]
         )
-        return there[:, :3], _unit(there[:, 3:])
+        return there[:, :3], unit(there[:, 3:])
 
 
 def zero_sum(normals: np.ndarray) -> np.ndarray:
@@ -206,26 +206,10 @@ def _costs(surface: Supported, grasp: Grasp, u: np.ndarray) -> tuple[np.ndarray,
     x = x.reshape(u.shape)
     rho = np.array([[c.tip_radius] for c in grasp.contacts])
     centers = x + rho * u
-    way = np.linalg.norm(centers - _centers(grasp), axis=-1)
+    way = np.linalg.norm(centers - grasp.centers, axis=-1)
     moment = np.cross(u, x).sum(axis=1)
     cost = (way**2 + (DOUBT_WORTH * doubt) ** 2).sum(axis=1)
     return cost + MOMENT_WORTH**2 * (moment * moment).sum(axis=1), centers
-
-
-def _distinct(cost: np.ndarray, centers: np.ndarray, many: int, apart: float) -> list[int]:
-    """The cheapest, at most `many`, each with a centre farther than `apart` from the others'."""
-    left = np.ones(len(cost), dtype=bool)
-    chosen: list[int] = []
-    while left.any() and len(chosen) < many:
-        i = int(np.argmin(np.where(left, cost, np.inf)))
-        left &= np.linalg.norm(centers - centers[i], axis=-1).max(axis=1) > apart
-        chosen.append(i)
-    return chosen
-
-
-def _centers(grasp: Grasp) -> np.ndarray:
-    rho = np.array([[c.tip_radius] for c in grasp.contacts])
-    return np.asarray(grasp.positions + rho * grasp.normals)
 
 
 def _cross_matrix(v: np.ndarray) -> np.ndarray:
@@ -233,7 +217,3 @@ def _cross_matrix(v: np.ndarray) -> np.ndarray:
     x, y, z = np.moveaxis(v, -1, 0)
     o = np.zeros_like(x)
     return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*v.shape, 3)
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

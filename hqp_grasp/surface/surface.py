@@ -9,6 +9,9 @@ import numpy as np
 
 from hqp_grasp.grasp import Grasp
 
+DISTINCT = 10  # ways, at most
+APART = 0.01  # [m] the place of a contact differs by, between two ways
+
 
 class Way(Protocol):
     """For every contact of a grasp, a way over the surface to where the forces would balance."""
@@ -46,3 +49,21 @@ def spread(count: int) -> np.ndarray:
     turn = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     ring = np.sqrt(1.0 - z * z)
     return np.column_stack([ring * np.cos(turn), ring * np.sin(turn), z])
+
+
+def distinct(
+    cost: np.ndarray, places: np.ndarray, many: int = DISTINCT, apart: float = APART
+) -> list[int]:
+    """The cheapest, at most `many`, each with a place (C, k, d) [m] `apart` from the others'."""
+    left = np.ones(len(cost), dtype=bool)
+    chosen: list[int] = []
+    while left.any() and len(chosen) < many:
+        i = int(np.argmin(np.where(left, cost, np.inf)))
+        left &= np.linalg.norm(places - places[i], axis=-1).max(axis=1) > apart
+        chosen.append(i)
+    return chosen
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """Vectors (…, 3) of length 1."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))

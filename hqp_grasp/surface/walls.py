@@ -8,13 +8,10 @@ import numpy as np
 
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.surface.felt import LEANING, SAME_NORMAL, SLACK, Felt
-from hqp_grasp.surface.outline import FLATTEST, Outline, directions
+from hqp_grasp.surface.outline import Outline, directions
+from hqp_grasp.surface.surface import distinct, unit
 
-DISTINCT = 10  # ways, at most
-APART = 0.01  # [m] a contact's place differs by, between two ways
-ROOM = 0.01  # [m] kept from end faces that were felt
-ROUNDING = 1e-6  # [m] radius of what bare points touch at an edge
-STILL = 1e-6  # [m] a contact that moves less has no direction
+FLATTEST = 1e-3  # [–] of normals, below which lifting contacts leaves their moment as it is
 SHARPER = 0.6  # [–] radius that each further touch of a face leaves of its corners
 FLATTER = 0.5  # [m] radius of what counts as flat
 FLAT = 1e-3  # [m] a face is known to be flat where it was felt so far apart
@@ -34,14 +31,12 @@ class Walls:
     outline: Outline
 
     @classmethod
-    def of(cls, felt: Felt, axis: np.ndarray, tip_radius: float) -> Walls | None:
-        """The outline from normals across the axis, around all other points; None: there are none.
+    def of(cls, felt: Felt, axis: np.ndarray, tip_radius: float) -> Walls:
+        """The outline from normals across the axis, of which there are some, around all points.
 
         `tip_radius` [m] is that of the tips whose centres ride on it.
         """
         across = np.abs(felt.normals @ axis) < LEANING
-        if not across.any():
-            return None
         first = np.eye(3)[np.abs(axis).argmin()]
         first = first - (first @ axis) * axis
         first /= np.linalg.norm(first)
@@ -62,102 +57,51 @@ class Walls:
         radius = self.felt.radii[away.argmin(axis=1)] + self.outline.tip_radius
         around = np.cross(self.axis, grasp.normals)
         blocks = around[:, :, None] * around[:, None]
-        return np.asarray(blocks / np.maximum(radius, ROUNDING)[:, None, None])
+        return np.asarray(blocks / np.maximum(radius, SLACK)[:, None, None])
 
     def reach(self, u: np.ndarray) -> np.ndarray:
         """As far (m,) [m] along u (m, 3) as was felt: where walls end is not known."""
         return np.asarray((u @ self.felt.positions.T).max(axis=1))
 
     def ways(self, grasp: Grasp) -> list[WayAround]:
-        """Ways around the outline that differ, the cheapest first."""
+        """Ways around the outline that differ, the cheapest first.
+
+        Heights z_i change by the least that makes Σ z_i n_i vanish, as the moment of forces across
+        the axis does: two or three forces balance at one height only, of more there is a choice.
+        """
         s = self.outline.locate(grasp.centers @ self.outline.frame.T)
         cost, places = self.outline.balanced(s)
-        end = np.abs(grasp.normals @ self.axis) > LEANING
-        own, between = self._heights(grasp, end)
-        ways: list[WayAround] = []
-        left = np.ones(len(cost), dtype=bool)
-        while left.any() and len(ways) < DISTINCT:
-            i = int(np.argmin(np.where(left, cost, np.inf)))
-            left &= np.abs(places - places[i]).max(axis=1) > APART
+        own, ways = grasp.centers @ self.axis, []
+        for i in distinct(cost, places[:, :, None]):
             n = directions(self.outline.at(places[i])[0]).T
-            height = np.clip(own - np.linalg.pinv(n, rcond=FLATTEST) @ (n @ own), *between)
-            ways.append(WayAround(self, grasp, s, places[i], height, end, float(cost[i])))
+            height = own - np.linalg.pinv(n, rcond=FLATTEST) @ (n @ own)
+            ways.append(WayAround(self, grasp, s, places[i], height, float(cost[i])))
         return ways
-
-    def _heights(self, grasp: Grasp, end: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
-        """Where along the axis contacts would be by themselves (k,), and may be [m].
-
-        That is where they are; one whose normal leans would first move to the height of its ball's
-        middle. From there heights z_i change by the least that makes Σ z_i n_i vanish, as the
-        moment of forces across the axis does: two or three forces balance at one height only, of
-        more there is a choice. End faces that were felt keep their distance.
-        """
-        x, lean = self.felt.positions @ self.axis, self.felt.normals @ self.axis
-        middle = x - self.felt.radii * lean
-        side = np.abs(lean) < LEANING
-        own = middle[-grasp.k :]  # the newest points are this grasp's
-        if not end.all():
-            mean = own[~end].mean()
-        else:
-            mean = middle[side].mean() if side.any() else x.mean()
-        own = np.where(end, mean, own)
-        top = x[lean > LEANING].min(initial=np.inf) - ROOM
-        bottom = x[lean < -LEANING].max(initial=-np.inf) + ROOM
-        if bottom > top:
-            bottom = top = 0.5 * (bottom + top)
-        return own, (float(bottom), float(top))
 
 
 @dataclass(frozen=True, eq=False)
 class WayAround:
-    """Along the outline, where the normal turns as the outline does, and to other heights.
-
-    From an end face the way leads out beside the object, then along the axis.
-    """
+    """Along the outline, where the normal turns as the outline does, and to other heights."""
 
     walls: Walls
     grasp: Grasp
     s: np.ndarray  # (k,) [m] where on the outline contacts are
     places: np.ndarray  # (k,) [m] where they should be
     height: np.ndarray  # (k,) [m] along the axis, where they should be
-    end: np.ndarray  # (k,) which contacts are on an end face or its rim, off the outline
     cost: float  # [m²]
 
     def at(self, share: float) -> tuple[np.ndarray, np.ndarray]:
         """The tips' centres (k, 3) [m] and the normals (k, 3) after a share of the way, world."""
         outline, a = self.walls.outline, self.walls.axis
-        E, n, c = outline.frame, self.grasp.normals, self.grasp.centers
+        n, c, E = self.grasp.normals, self.grasp.centers, outline.frame
         rho = np.array([[contact.tip_radius] for contact in self.grasp.contacts])
-        rise = share * (self.height - c @ a)
-        t0, x0 = outline.at(self.s)
-        t1, x1 = outline.at(self.s + share * (self.places - self.s))
-        across, turned = n @ E.T, np.empty((self.grasp.k, 2))
-        cos, sin = np.cos(t1 - t0), np.sin(t1 - t0)
-        turned[:, 0] = cos * across[:, 0] - sin * across[:, 1]
-        turned[:, 1] = sin * across[:, 0] + cos * across[:, 1]
-        after = _unit(turned @ E + (1.0 - share) * np.outer(n @ a, a))
-        motion = (
-            (x1 - x0) @ E + rho * (after - n) + np.outer(rise - rho[:, 0] * ((after - n) @ a), a)
-        )
-        if self.end.any():
-            t, x = outline.at(self.places)
-            side = directions(t) @ E
-            straight = x @ E + rho * side + np.outer(self.height, a) - c
-            sink = np.outer(straight @ a, a)
-            beside = straight - sink
-            out = np.linalg.norm(beside, axis=1)[:, None]
-            down = np.linalg.norm(sink, axis=1)[:, None]
-            done = share * (out + down)
-            straight = beside * np.minimum(done / np.maximum(out, STILL), 1.0)
-            straight += sink * np.clip((done - out) / np.maximum(down, STILL), 0.0, 1.0)
-            end = self.end[:, None]
-            after = np.where(end, _unit((1.0 - share) * n + share * side), after)
-            motion = np.where(end, straight, motion)
-        return c + motion, after
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return np.asarray(v / np.linalg.norm(v, axis=1)[:, None])
+        (t0, x0), (t1, x1) = outline.at(self.s), outline.at(self.s + share * (self.places - self.s))
+        cos, sin = np.cos(t1 - t0)[:, None], np.sin(t1 - t0)[:, None]
+        side = n @ E.T
+        turned = cos * side + sin * np.column_stack([-side[:, 1], side[:, 0]])
+        after = unit(turned @ E + (1.0 - share) * np.outer(n @ a, a))
+        across = x1 - x0 + rho * ((after - n) @ E.T)
+        return c + across @ E + np.outer(share * (self.height - c @ a), a), after
 
 
 def _corners(x: np.ndarray, n: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,7 +47,7 @@ def hand(seed, normals, n=11):
 
 
 def walls(*grasps):
-    return believed(Felt.of([Touch(g.q, g) for g in grasps]), grasps[-1])
+    return believed(Felt.of([Touch(g.q, g) for g in grasps]), grasps[-1], 1e-3)
 
 
 def alone(grasp):

@@ -58,7 +58,7 @@ def back(progress, left, grasp=None):
 
 def targets_of(*grasps, laws="fmk", stack=None):
     """Targets from the last of these grasps, and the surface they are on."""
-    surface = believed(Felt.of([Touch(g.q, g) for g in grasps]), grasps[-1])
+    surface = believed(Felt.of([Touch(g.q, g) for g in grasps]), grasps[-1], 1e-3)
     return Target.each(surface, stack or stack_of(laws), grasps[-1]), surface
 
 

@@ -10,7 +10,7 @@ from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.surface.believed import believed
 from hqp_grasp.surface.felt import SLACK, UNDECIDED, Felt
-from hqp_grasp.surface.outline import Outline, directions, summing_to_zero, wrapped
+from hqp_grasp.surface.outline import SAME_ANGLE, Outline, _zero_sum, directions, wrapped
 from hqp_grasp.surface.rounded import Rounded
 from hqp_grasp.surface.walls import Walls
 
@@ -272,22 +272,20 @@ def test_noise_neither_sharpens_a_circle_nor_has_it_forgotten():
 # ---------------------------------------------------------------- any number of contacts
 
 
-@pytest.mark.parametrize("k", [4, 5, 6, 7, 8])
+@pytest.mark.parametrize("k", range(2, 9))
 def test_angles_near_those_given_sum_to_zero_in_their_order(k):
     rng = np.random.default_rng(k)
     theta = 2.0 * np.pi * np.arange(k) / k + 0.2 * rng.standard_normal(k)
-    place = np.argsort(np.argsort(theta % (2.0 * np.pi)))
-    t = summing_to_zero(theta, place)
-    np.testing.assert_allclose(directions(t).sum(axis=0), 0.0, atol=1e-6)
-    np.testing.assert_array_equal(np.argsort(t), np.argsort(place))
-    off = wrapped(t - theta - wrapped(t - theta)[0])
-    equal = wrapped(2.0 * np.pi / k * place - theta)
-    assert np.linalg.norm(off - off.mean()) < np.linalg.norm(equal - equal.mean()) + 1e-9
+    t = _zero_sum(theta)
+    np.testing.assert_allclose(directions(t).sum(axis=0), 0.0, atol=SAME_ANGLE)
+    assert (np.diff(t, append=t[0]) % (2.0 * np.pi)).sum() == pytest.approx(2.0 * np.pi)
+    equal = 2.0 * np.pi / k * np.arange(k)
+    # But for a turn of all together they are nearer than equal angles.
+    assert abs(np.exp(1j * (t - theta)).sum()) > abs(np.exp(1j * (equal - theta)).sum()) - 1e-3
 
 
 def test_parallel_normals_are_spread_evenly():
-    t = summing_to_zero(np.zeros(5), np.arange(5))
-    np.testing.assert_allclose(t, 2.0 * np.pi / 5 * np.arange(5))
+    np.testing.assert_allclose(_zero_sum(np.zeros(5)), 2.0 * np.pi / 5 * np.arange(5))
 
 
 @pytest.mark.parametrize("k", range(2, 9))
@@ -324,7 +322,7 @@ def test_walls_reach_as_far_as_was_felt():
     )
 
 
-@pytest.mark.parametrize("lean", [0.0, 0.02, 0.05, 0.2])
+@pytest.mark.parametrize("lean", [0.0, 0.01, 0.011, 0.2])
 def test_where_normals_lean_by_more_than_noise_explains_all_is_rounded(lean):
     def leaning(lean, noise=0.0, rims=3):
         grasp = on_circle(0.05, 0.0, 120.0, 240.0).felt
@@ -339,9 +337,9 @@ def test_where_normals_lean_by_more_than_noise_explains_all_is_rounded(lean):
         grasp = dataclasses.replace(grasp, contacts=tuple(contacts))
         # Walls below and above tell the axis.
         flat = [on_circle(0.05, *(40.0 * i + np.array([0.0, 120.0, 240.0]))) for i in range(2)]
-        return believed(Felt.of([*flat, Touch(grasp.q, grasp)]), grasp)
+        return believed(Felt.of([*flat, Touch(grasp.q, grasp)]), grasp, 1e-3)
 
-    assert isinstance(leaning(lean), Rounded if lean > 0.03 else Walls)
+    assert isinstance(leaning(lean), Rounded if (3.0 * lean) ** 2 > 1e-3 else Walls)
     assert isinstance(leaning(lean, rims=1), Walls)
     assert isinstance(leaning(lean, noise=0.03), Rounded if lean > 0.1 else Walls)
 
