@@ -189,3 +189,49 @@ def test_values_are_frozen():
         if mark.startswith("dataclass") and "frozen=True" not in mark
     ]
     assert thawed == ["_Looking"]
+
+
+# ---------------------------------------------------------------- the planner's room
+
+ROOM = [
+    path
+    for folder in ("control", "surface")
+    for path in sorted((PACKAGE / folder).glob("*.py"))
+    if path.name not in ("forces.py", "hold.py")
+]
+
+
+def constants(source):
+    """Names of a module's constants: assigned at its top, in capitals."""
+    for node in ast.parse(source).body:
+        assigned = [node.target] if isinstance(node, ast.AnnAssign) else []
+        for target in node.targets if isinstance(node, ast.Assign) else assigned:
+            names = (name.id for name in ast.walk(target) if isinstance(name, ast.Name))
+            yield from (name for name in names if name.isupper())
+
+
+def test_the_planners_room_has_no_more_constants_than_it_had():
+    """A constant is a debt: a new one takes the place of another, or moves this bound knowingly."""
+    found = [f"{p.name}: {name}" for p in ROOM for name in constants(p.read_text("utf-8"))]
+    assert len(found) <= 53, found
+    assert list(constants("A = 1\nB: int = 2\nc = 3\nD, E = 4, 5\ndef f():\n    G = 6\n")) == [
+        *"ABDE"
+    ]
+
+
+def test_the_planners_room_has_no_type_ignore_and_no_function_over_fifty_lines():
+    for path in ROOM:
+        source = path.read_text("utf-8")
+        assert "type: ignore" not in source, path.name
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.FunctionDef):
+                assert node.end_lineno - node.lineno < 50, f"{path.name}: {node.name}"
+
+
+def test_no_law_and_no_probe_is_known_by_its_type_in_the_planners_room():
+    kinds = {"Task", "ForceTask", "MomentTask", "KinematicTask", "ContactSpaceTask", "Probe"}
+    for path in ROOM:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
+                asked = {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
+                assert not asked & kinds, f"{path.name}: {ast.unparse(node)}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hqp_grasp.control.episode import BROKEN, Episode, MissPolicy
+from hqp_grasp.control.episode import Episode, MissPolicy
 from hqp_grasp.control.forms import Form, form_of
 from hqp_grasp.control.landing import land
 from hqp_grasp.control.limits import (
@@ -129,7 +129,7 @@ class Controller:
             "from the first grasp again": episode.again,
             ", ".join(self._told(back)): back,
             f"{share:g} of the step": short,
-            "the same again": misses and misses[-1].reason in BROKEN,
+            "the same again": misses and misses[-1].reason in policy.broken,
         }
         told = [what for what, done in reactions.items() if done]
         reason = ", ".join([*told, plan.reason] if plan.reason else told)

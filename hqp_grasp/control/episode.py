@@ -12,10 +12,6 @@ from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
 from hqp_grasp.surface.denoise import denoised
 from hqp_grasp.world.robot import Robot
 
-IN_THE_WAY = (Miss.OTHER_LINK, Miss.TABLE, Miss.INSIDE)  # what a palm withdraws from
-BROKEN = (Miss.SENSOR, Miss.STUCK)  # no fault of the step, and it may pass
-PASSING = (*BROKEN, Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR)  # what the first touch tries again
-
 
 @dataclass(frozen=True)
 class MissPolicy:
@@ -23,10 +19,10 @@ class MissPolicy:
 
     The step is taken again from the last grasp, shorter. Where another link than the contact points
     met the object, or an open finger was in it, or a tip met the table, the palm of that group
-    withdraws on the next step. Where a sensor was
-    silent, or the hand did not open, the same step is tried again. When nothing is left to try, the
-    hand begins again from its first grasp; where that brings no touch either, it gives up. Where
-    the very first touch finds nothing, the palm is sent beside there, level, all around.
+    withdraws on the next step. Where a sensor was silent, or the hand did not open, the same step
+    is tried again. When nothing is left to try, the hand begins again from its first grasp; where
+    that brings no touch either, it gives up. Where the very first touch finds nothing, the palm is
+    sent beside there, level, all around.
     """
 
     shares: tuple[float, ...] = (1.0, 0.5, 0.25)  # of a step, in turn while it touches nothing
@@ -36,31 +32,36 @@ class MissPolicy:
     restart: bool = False  # whether the hand begins again from its first grasp, once
     beside: float = 0.02  # [m] of the palm, from a first touch that found nothing
     around: tuple[float, ...] = (0, 180, 90, 270, 45, 225, 135, 315)  # [°] about the vertical
+    in_the_way: tuple[Miss, ...] = (Miss.OTHER_LINK, Miss.TABLE, Miss.INSIDE)  # a palm withdraws
+    broken: tuple[Miss, ...] = (Miss.SENSOR, Miss.STUCK)  # no fault of the step, and it may pass
+    passing: tuple[Miss, ...] = (Miss.BLOCKED, Miss.LOST, Miss.UNCLEAR)  # so may a first touch's
 
     def spent(self, misses: Sequence[Missed]) -> bool:
         """Whether nothing is left to try from a grasp after these misses."""
         return (
             self.shorter(misses) == len(self.shares)
-            or sum(missed.reason in IN_THE_WAY for missed in misses) == self.retreats
-            or sum(missed.reason in BROKEN for missed in misses) == self.repeats
+            or sum(missed.reason in self.in_the_way for missed in misses) == self.retreats
+            or sum(missed.reason in self.broken for missed in misses) == self.repeats
         )
 
     def shorter(self, misses: Sequence[Missed]) -> int:
         """How many misses found nothing, for which the step gets shorter."""
-        return sum(missed.reason not in IN_THE_WAY + BROKEN for missed in misses)
+        return sum(missed.reason not in self.in_the_way + self.broken for missed in misses)
 
     def withdrawal(self, misses: Sequence[Missed]) -> float:
         """How far [m] a palm withdraws, for the last misses of its group, if in the way."""
-        return self.retreat * [*[m.reason in IN_THE_WAY for m in misses[::-1]], False].index(False)
+        in_the_way = [m.reason in self.in_the_way for m in reversed(misses)]
+        return self.retreat * [*in_the_way, False].index(False)
 
     def direction(self, misses: Sequence[Missed]) -> np.ndarray | None:
         """Where to send the palm (3,) [m] after first touches that missed; None: nowhere is left.
 
         Zeros where the same is worth another try.
         """
-        if misses[-1].reason in PASSING and len(misses) < self.repeats:
+        passing = self.broken + self.passing
+        if misses[-1].reason in passing and len(misses) < self.repeats:
             return np.zeros(3)
-        tried = sum(missed.reason not in PASSING for missed in misses)
+        tried = sum(missed.reason not in passing for missed in misses)
         if not 0 < tried <= len(self.around):
             return None
         angle = np.radians(self.around[tried - 1])
@@ -98,7 +99,7 @@ class Episode:
                 now, lost = cls((), touch.felt), False
                 continue
             misses = (*now.misses, touch.felt)
-            unlucky = policy.spent(misses) and touch.felt.reason not in BROKEN
+            unlucky = policy.spent(misses) and touch.felt.reason not in policy.broken
             if policy.restart and grasps and not lost and unlucky:
                 way = tuple(grasp.q for grasp in reversed(grasps[:-1]))
                 now, lost = cls((), grasps[0], (), True, way), True

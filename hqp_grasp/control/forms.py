@@ -28,8 +28,6 @@ from hqp_grasp.tasks import ForceTask, Priority, Stack
 from hqp_grasp.tasks.contact_space import in_contact_space
 from hqp_grasp.tasks.kinematic import is_kinematic
 
-EARLY = 10  # touches, in which fingers that push aside are first brought to push into the surface
-LEANING = 0.25 * np.pi  # [rad] their mean angle to the normals, above which they do not
 TOUCH_RANK = 1e-6  # [–] normals felt to 1e-7 say nothing about directions weaker than this
 SR_DAMPING = 1e-5  # λ of eq. 13 [m²/rad²]
 
@@ -139,6 +137,8 @@ class HierarchyForm(Form):
 
     hqp: HQP = field(default_factory=_hqp)
     size: float = 0.05  # [m] radius of the object, where nothing felt tells more
+    early: int = 10  # touches, in which fingers that push aside are first turned to push into it
+    aside: float = 0.25 * np.pi  # [rad] their mean angle to the normals, above which they do
     surface: Surface | None = None  # the object's, where it is known; None: what was felt of it
     misses: ClassVar[MissPolicy] = MissPolicy(shares=(1.0, 0.5, 0.25, 0.1) * 2, restart=True)
 
@@ -166,8 +166,8 @@ class HierarchyForm(Form):
         grasp = episode.stand
         if grasp.k < 2 or all(task.goal is None for task in stack.tasks):
             return None
-        early = len(episode.touches) <= EARLY and not episode.missed
-        if early and _fingers_lean(stack, grasp) and not why_not(stack):
+        early = len(episode.touches) <= self.early and not episode.missed
+        if early and _angle_aside(stack, grasp) > self.aside and not why_not(stack):
             return PaperHierarchyForm(self.hqp).plan(stack, episode)
         apart = np.linalg.norm(grasp.positions - grasp.positions.mean(axis=0), axis=1).mean()
         felt = Felt.of(episode.touches, 2.0 * max(self.size, float(apart)))
@@ -195,10 +195,10 @@ class HierarchyForm(Form):
         return replace(plan, exact=True)
 
 
-def _fingers_lean(stack: Stack, grasp: Grasp) -> bool:
-    """Whether the kinematic law's mean angle says that fingers push along the surface."""
+def _angle_aside(stack: Stack, grasp: Grasp) -> float:
+    """The fingers' mean angle [rad] to the normals, by the kinematic law; 0 where there is none."""
     angles = [task for task in stack.tasks if is_kinematic(task) and task.unit == "rad"]
-    return any(float(task.error(grasp).mean()) > LEANING for task in angles)
+    return max((float(task.error(grasp).mean()) for task in angles), default=0.0)
 
 
 FORMS = ("hierarchy", "memoryless", "paper-hierarchy", "clipped", "paper")

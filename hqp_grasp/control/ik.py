@@ -17,8 +17,6 @@ from hqp_grasp.tasks.mink_rows import require_width, rows
 
 Tasks = BaseTask | Sequence[BaseTask]  # that share a level
 
-CAPS = (mink.VelocityLimit, mink.FreeJointVelocityLimit)
-
 
 def solve_ik(
     configuration: mink.Configuration,
@@ -93,7 +91,7 @@ def ik_levels(
 
 
 def _priority(limit: mink.Limit) -> Priority:
-    if isinstance(limit, CAPS):
+    if isinstance(limit, mink.VelocityLimit | mink.FreeJointVelocityLimit):
         return Priority.CAP
     return Priority.RANGE if isinstance(limit, mink.ConfigurationLimit) else Priority.CLEARANCE
 
@@ -108,7 +106,7 @@ def _limit_level(limit: mink.Limit, configuration: mink.Configuration, dt: float
     kept = h != np.inf
     if not kept.all():
         G, h = G[kept], h[kept]
-    if isinstance(limit, CAPS):
+    if _priority(limit) is Priority.CAP:
         unit = np.where(h > 0.0, h, 1.0)
         G, h = G / unit[:, None], h / unit
     half = len(h) // 2

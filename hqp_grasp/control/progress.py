@@ -11,17 +11,15 @@ import numpy as np
 from hqp_grasp.control.limits import cap_ratios
 from hqp_grasp.grasp import BEYOND, Grasp, Touch
 from hqp_grasp.mechanics import SECURE, friction_demand
+from hqp_grasp.surface.felt import SLACK, SURE
 from hqp_grasp.tasks import Stack, Task
 
 Beside = tuple[Task, ...]  # laws at one priority
 
 BETTER = 2e-3  # [rad] by which the other laws' errors fall, or the grasp is no better
-TELLING = 2.0  # standard errors that tell two values apart
 HOPE = 20  # touches that bring no better grasp, before one that is secure is kept
 PATIENCE = 3  # balanced grasps that are no better, before the hand settles
 BACK = 1e-3  # [rad] from a posture, within which the hand is back there
-WRENCH = 6  # rows of laws with a goal that balance all of it
-SAME_ROUNDING = 1e-6  # [m] radii of one tip differ by, as long as it is a ball
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,7 @@ class Progress:
         met = [bool((errors <= BETTER).all()) for errors in away]
         noise = sum(contact.noise**2 for contact in hits[-1].contacts)  # [rad²] of the angles' sum
         patience = PATIENCE + noise / BETTER**2
-        tells = max(BETTER, TELLING * np.sqrt(2.0 * noise))
+        tells = max(BETTER, SURE * np.sqrt(2.0 * noise))
         best, stale, lost, worse = -1, 0, False, 0
         least: tuple[float, ...] = ()
         for i, touch in enumerate(touches):
@@ -83,7 +81,7 @@ class Progress:
         if best >= 0:
             return cls(stack, touches, scores, best, best, worse, lost or stale >= patience)
         rows = sum(len(task.error(hits[0])) for task in stack.tasks if task.goal is not None)
-        nearest, over = _nearest(touches, served, doubtful, rows >= WRENCH)
+        nearest, over = _nearest(touches, served, doubtful, rows >= 6)  # of a wrench
         return cls(stack, touches, scores, nearest, best, worse, over)
 
     @property
@@ -103,7 +101,7 @@ class Progress:
         halvings = self.worse
         hits = [t.felt for t in self.touches if isinstance(t.felt, Grasp)]
         radii = np.array([[contact.tip_radius for contact in grasp.contacts] for grasp in hits])
-        if np.ptp(radii, axis=0).max() > SAME_ROUNDING:
+        if np.ptp(radii, axis=0).max() > SLACK:
             halvings += len(self.unbalanced) - 1
         return 0.5 ** max(halvings, 0)
 
@@ -167,7 +165,7 @@ def _nearest(
 def _friction_angle(grasp: Grasp) -> float:
     """Angle [rad] whose tangent is the friction demand, the larger for noise of the normals."""
     noise = max(contact.noise for contact in grasp.contacts)
-    return float(np.arctan(friction_demand(grasp.positions, grasp.normals))) + TELLING * noise
+    return float(np.arctan(friction_demand(grasp.positions, grasp.normals))) + SURE * noise
 
 
 @lru_cache(maxsize=512)

@@ -14,7 +14,6 @@ from hqp_grasp.world.robot import Robot
 MAX_STEPS = 60
 STEP = 0.3  # [rad]
 TOLERANCE = 1e-4  # [m, rad]
-HOMING = 0.1  # [–]
 APART = 0.02  # [m] of the palm, at most, between two postures of a straight way
 
 
@@ -24,7 +23,7 @@ def reach(
     p_palm: np.ndarray,
     R_palm: np.ndarray,
     keep: Sequence[int],
-    homing: float = HOMING,
+    homing: float = 0.1,
     group: int = 0,
 ) -> np.ndarray | None:
     """Joints (n,) [rad], from q (n,) on, that bring a palm to p (3,) [m], R (3, 3), world.

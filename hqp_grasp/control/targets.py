@@ -18,8 +18,7 @@ from hqp_grasp.tasks.contact_space import in_contact_space
 from hqp_grasp.world.clearance import link_balls
 from hqp_grasp.world.robot import Robot
 
-STEP = 1e-6  # [m] of the differences that slopes are
-STILL = 1e-6  # [m] a contact that moves less has no direction
+STEP = 1e-6  # [m] of the differences that slopes are; a contact that moves less has no direction
 POSTURES = 5  # on the way, at which the hand must be able to be
 CORRECTIONS = 2  # of Newton's method, from one to the next
 AWAY = 2e-3  # [m] off its way a contact may stay: what landing makes good
@@ -143,13 +142,13 @@ class Target:
         grasp, e = self.grasp, task.error(self.grasp)
         first = tangents(grasp.normals)[:, 0]
         far = np.linalg.norm(motion, axis=1)
-        moves = (far > STILL)[:, None]
-        along = np.where(moves, motion / np.maximum(far, STILL)[:, None], first)
+        moves = (far > STEP)[:, None]
+        along = np.where(moves, motion / np.maximum(far, STEP)[:, None], first)
         across = unit(np.cross(grasp.normals, along))
         change = np.array([task.error(self.imagined(share, i)) - e for i in range(grasp.k)])
         whole = task.error(self.imagined(share)) - e
         change[moves[:, 0]] += (whole - change.sum(axis=0)) / max(int(moves.sum()), 1)
-        slope = np.where(moves, change / np.maximum(far, STILL)[:, None], self._slopes(task, along))
+        slope = np.where(moves, change / np.maximum(far, STEP)[:, None], self._slopes(task, along))
         blocks = slope[:, :, None] * along[:, None, :]
         blocks = blocks + self._slopes(task, across)[:, :, None] * across[:, None, :]
         A = blocks.swapaxes(0, 1).reshape(len(e), -1) @ grasp.jacobian

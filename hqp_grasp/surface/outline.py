@@ -11,6 +11,7 @@ from hqp_grasp.surface.supported import MOMENT_WORTH, zero_sum
 DIRECTIONS = 720  # in which the hull of discs is looked up
 FIRST_WINS = 1e-8  # [m] by which a later disc must stick out to count
 SHORTEST = 5e-4  # [m] of a straight piece along which contacts may be moved
+GRID = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)  # [rad] where balance is tried at least
 SAME_ANGLE = 1e-4  # [rad] straight pieces nearer than this to an angle have it
 
 
@@ -131,7 +132,7 @@ class Outline:
         = A cos θ + B sin θ: its zeros there, and the middle, are tried.
         """
         arcs = np.flatnonzero(self.straight == 0.0)
-        cuts = (self.angle[arcs][:, None] - shift).ravel()
+        cuts = np.append((self.angle[arcs][:, None] - shift).ravel(), GRID)
         cuts = np.sort(cuts % (2.0 * np.pi))
         ends = np.append(cuts[1:], cuts[0] + 2.0 * np.pi)
         middle = 0.5 * (cuts + ends)

@@ -256,7 +256,7 @@ def test_the_way_is_led_by_the_smallest_gain_of_its_laws_and_never_beyond_it():
             HierarchyForm().plan(Stack.of(ForceTask(gain=gain)).within(WIDE), alone(grasp)).x
             @ np.array(grasp.jacobian).T,
             (way[0] - grasp.centers).ravel(),
-            atol=1e-6,
+            atol=2e-6,  # the solver's, of 4 cm
         )
     np.testing.assert_allclose(left[2.0], left[1.0], atol=1e-4)
 
