@@ -16,7 +16,7 @@ from hqp_grasp.control.paper import laws, paper_levels, why_not
 from hqp_grasp.control.progress import Progress
 from hqp_grasp.control.step import Plan, scaled, strict_step
 from hqp_grasp.control.targets import Target, nearest_free
-from hqp_grasp.errors import instance, one_of, positive
+from hqp_grasp.errors import instance, one_of, positive, whole
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
@@ -147,6 +147,8 @@ class HierarchyForm(Form):
         if self.surface is not None:
             instance("HierarchyForm.surface", self.surface, Surface)
         object.__setattr__(self, "size", positive("HierarchyForm.size [m]", self.size))
+        object.__setattr__(self, "early", whole("HierarchyForm.early", self.early, 0))
+        object.__setattr__(self, "aside", positive("HierarchyForm.aside [rad]", self.aside))
 
     def plan(self, stack: Stack, episode: Episode) -> Plan:
         begin = time.perf_counter()
