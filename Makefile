@@ -6,6 +6,7 @@ SEED ?= 1            # draws the mutants
 
 VENV := .venv
 PY := $(VENV)/bin/python
+HQP := $(VENV)/bin/hqp-grasp
 PIP := $(PY) -m pip install --quiet --no-input --disable-pip-version-check
 # numba compiles the solver at its first call and keeps what it made: half a minute, once.
 COMPILE := $(PY) -c 'import numpy as n, hqp_grasp as h; h.HQP().solve([h.Level.equal(n.eye(2), n.ones(2))])'
@@ -49,7 +50,7 @@ help:
 	@echo 'Each installs what it needs into .venv first; PYTHON=python3.12 chooses the Python.'
 
 demo: $(READY)
-	$(PY) scenarios/cylinder.py --out out/cylinder
+	$(HQP) run cylinder --out out/cylinder
 
 test: lint $(READY_DEV)
 	$(PY) -m pytest $(PYTEST_ARGS)
@@ -90,12 +91,12 @@ mutants: $(READY_DEV)
 RESULTS := out/results
 keep = $(PY) $(2) > $(RESULTS)/$(1).txt
 define judged
-$(PY) scenarios/$(1).py --trials 100 --probes 20 --seed 83 --out $(RESULTS)/judged-$(1) > $(RESULTS)/judged-$(1).txt
-$(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --protocol pulls dexgraspbench >> $(RESULTS)/judged-$(1).txt
-$(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --force 10 --mass 0.5 >> $(RESULTS)/judged-$(1).txt
-$(PY) -m hqp_grasp judge $(RESULTS)/judged-$(1) --force 1 --protocol dexgraspbench >> $(RESULTS)/judged-$(1).txt
+$(HQP) run $(1) --trials 100 --probes 20 --seed 83 --out $(RESULTS)/judged-$(1) > $(RESULTS)/judged-$(1).txt
+$(HQP) judge $(RESULTS)/judged-$(1) --protocol pulls dexgraspbench >> $(RESULTS)/judged-$(1).txt
+$(HQP) judge $(RESULTS)/judged-$(1) --force 10 --mass 0.5 >> $(RESULTS)/judged-$(1).txt
+$(HQP) judge $(RESULTS)/judged-$(1) --force 1 --protocol dexgraspbench >> $(RESULTS)/judged-$(1).txt
 endef
-study = $(PY) scenarios/$(1).py --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
+study = $(HQP) run $(1) --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
 
 results: $(READY_BENCH) pictures
 	rm -rf $(RESULTS)
@@ -116,12 +117,12 @@ results: $(READY_BENCH) pictures
 	$(call study,cylinder,-pass,--links pass)
 	$(call study,cylinder,-eq7,--kinematic-error eq7)
 	$(call study,cylinder,-no-landing,--no-landing)
-	$(PY) -m hqp_grasp report $(RESULTS)/cylinder $(RESULTS)/cylinder-* > $(RESULTS)/report-cylinder.txt
-	$(PY) -m hqp_grasp report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
+	$(HQP) report $(RESULTS)/cylinder $(RESULTS)/cylinder-* > $(RESULTS)/report-cylinder.txt
+	$(HQP) report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
 	cp $(RESULTS)/cylinder/convergence.png docs/images/cylinder-convergence.png
-	$(call keep,cylinder-physical,scenarios/cylinder.py --probe physical --preset loadcell --out $(RESULTS)/cylinder-physical)
+	$(HQP) run cylinder --probe physical --preset loadcell --out $(RESULTS)/cylinder-physical > $(RESULTS)/cylinder-physical.txt
 	for object in cylinder cylinder_65 hexagon irregular; do for cells in "" "--preset loadcell"; do \
-	  $(PY) -m hqp_grasp pick $$object --mass 0.5 $$cells --trials 25 --seed 2027 \
+	  $(HQP) pick $$object --mass 0.5 $$cells --trials 25 --seed 2027 \
 	    --out "$(RESULTS)/pick-$$object$${cells##* }" > "$(RESULTS)/pick-$$object$${cells##* }.txt" || exit 1; \
 	done; done
 	$(call keep,picks,benchmarks/picks.py --trials 10 --seed 2028)
@@ -129,7 +130,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,figures-paper,benchmarks/figures.py --form paper)
 	$(call keep,damping,benchmarks/damping.py --trials 100 --seed 53)
 	$(call keep,compositions,benchmarks/compositions.py --trials 20 --seed 31)
-	$(call keep,figure5,scenarios/cylinder_65.py --robot umass_torso --probe physical --preset loadcell --trials 20 --probes 25 --out $(RESULTS)/figure5)
+	$(HQP) run cylinder_65 --robot umass_torso --probe physical --preset loadcell --trials 20 --probes 25 --out $(RESULTS)/figure5 > $(RESULTS)/figure5.txt
 	$(call keep,forces,benchmarks/forces.py)
 	$(call judged,cylinder)
 	$(call judged,cylinder_65)

@@ -8,7 +8,7 @@ in joint space, by the last grasp alone. "paper" composes in contact space (eq. 
 is defined: the kinematic law last. "hierarchy", the default, plans otherwise than "memoryless" only
 where force and moment both are there; with fewer laws all it adds is to settle. The kinematic law
 asks for a step of every joint, so what stands below it is never felt: fkm is fk, mkf is mk, and all
-that begin with k are k. "Good" and the kinds of failure are those of `python -m hqp_grasp report`;
+that begin with k are k. "Good" and the kinds of failure are those of `hqp-grasp report`;
 the last column is the difference to memoryless f ▷ m ▷ k, in pairs of the same start.
 """
 

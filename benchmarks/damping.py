@@ -2,7 +2,7 @@
 
     python benchmarks/damping.py --trials 100 --seed 53
 
-"Good" and the kinds of failure are those of `python -m hqp_grasp report`. Probes are those until it
+"Good" and the kinds of failure are those of `hqp-grasp report`. Probes are those until it
 stays balanced, median (worst); the last column is what is left at the last touch, in the median.
 """
 

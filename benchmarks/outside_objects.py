@@ -3,7 +3,7 @@
     python benchmarks/outside_objects.py --trials 100 --seed 60 --pictures docs/images
 
 `make outside` installs the package, without its dependencies. Counts trials by the kinds of
-`python -m hqp_grasp report`, and draws the first good grasp of each object.
+`hqp-grasp report`, and draws the first good grasp of each object.
 """
 
 from __future__ import annotations

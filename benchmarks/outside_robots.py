@@ -4,7 +4,7 @@
     python benchmarks/outside_robots.py --only shadow --trials 20
 
 Their files come from pip packages, which `make outside` installs; the descriptions are in
-benchmarks/robots/. "Good" is the verdict of `python -m hqp_grasp report`; beside it stand the
+benchmarks/robots/. "Good" is the verdict of `hqp-grasp report`; beside it stand the
 deepest overlap of the robot's own links and the largest violation at any probe of a good trial.
 """
 

@@ -341,7 +341,7 @@ def main(
     """
     compared = methods()
     checked = min(checked, problems)
-    note = "" if pink else "; pink is not installed: pip install 'hqp_grasp[bench]'"
+    note = "" if pink else "; pink is not installed: pip install pin-pink"
     print(f"{problems} problems each, seed {seed}, times in µs, ratios to {REFERENCE}'s{note}")
     if not sizes:
         for k, difficulty in enumerate(AMPLITUDE):

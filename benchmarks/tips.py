@@ -3,7 +3,7 @@
     python benchmarks/tips.py --trials 20 --seed 906
 
 The trident is that of docs/any-robot.md, as the page shows it; the others are in
-benchmarks/robots/. "Good" is the verdict of `python -m hqp_grasp report`.
+benchmarks/robots/. "Good" is the verdict of `hqp-grasp report`.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ PARTS = {
 }
 BELONGS = {"history": "grasp"}  # other modules at the top of the package
 BESIDE = "  # "
+VALUES = {"GRIP_LAWS": "The laws that a `Grip` and a `Hold` press by, unless told otherwise."}
 STAR = re.compile(r"(?<=\w)\*(?=\w|\s*[=+)])")  # in J*J, unlike that of *emphasis*
 
 
@@ -32,14 +33,21 @@ def on_files(files: Files, config: MkDocsConfig, **_: Any) -> None:
     for name in hqp_grasp.__all__:
         part = getattr(hqp_grasp, name).__module__.split(".")[1]
         names[BELONGS.get(part, part)].append(name)
-    overview = ["# Reference", "All that `import hqp_grasp as hg` brings, by part of the package."]
+    overview = ["# Reference", "All that `import hqp_grasp as hg` brings, by topic, a line each."]
     for part, title in PARTS.items():
         about = (importlib.import_module(f"hqp_grasp.{part}").__doc__ or "").splitlines()[0]
-        listed = " · ".join(f"[{n}]({part}.md#hqp_grasp.{n})" for n in names[part])
-        overview += [f"## [{title}]({part}.md)", about, listed]
+        listed = [f"- [`{n}`]({part}.md#hqp_grasp.{n}): {line(n)}" for n in names[part]]
+        overview += [f"## [{title}]({part}.md)", about, "\n".join(listed)]
         page = [f"# {title}", about, *(f"::: hqp_grasp.{name}" for name in names[part])]
         files.append(_page(config, part, page))
     files.append(_page(config, "index", overview))
+
+
+def line(name: str) -> str:
+    """What an exported name is, in the words that its docstring begins with."""
+    if name in VALUES:
+        return VALUES[name]
+    return STAR.sub(r"\*", (getattr(hqp_grasp, name).__doc__ or "").strip().splitlines()[0])
 
 
 def _page(config: MkDocsConfig, name: str, paragraphs: list[str]) -> File:

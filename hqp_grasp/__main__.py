@@ -1,4 +1,4 @@
-"""The command line of the package: python -m hqp_grasp COMMAND; --help lists the commands."""
+"""The command line of the package: hqp-grasp COMMAND; --help lists the commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from tyro.conf import Positional
 from tyro.extras import SubcommandApp
 
 import hqp_grasp.scenarios
+from hqp_grasp import __version__
 from hqp_grasp.errors import HqpGraspError, one_of
+from hqp_grasp.experiments import doctor as health
 from hqp_grasp.experiments import picking
 from hqp_grasp.experiments import report as reports
 from hqp_grasp.experiments.judging import Judging, judge_folder, summary
@@ -139,9 +141,18 @@ def robot(
     print(check(path, hand, picture))
 
 
+@app.command
+def doctor() -> None:
+    """Say what of hqp_grasp works on this machine: versions, extras, solver, browser, renderer."""
+    print(health.doctor())
+
+
 def main() -> None:
     """Run the command that the arguments name; what is wrong is said in one line."""
     speak_plainly()
+    if sys.argv[1:] == ["--version"]:
+        print(f"hqp_grasp {__version__}")
+        return
     try:
         command = {"run": run, "pick": pick}.get("".join(sys.argv[1:2]))
         if command and len(sys.argv) > 2 and not sys.argv[2].startswith("-"):
@@ -149,7 +160,7 @@ def main() -> None:
             sys.argv[1:3] = []  # the scenario reads the rest
             command(name)
         else:
-            app.cli(prog="python -m hqp_grasp")
+            app.cli(prog="hqp-grasp", description=f"hqp_grasp {__version__}: grasping by touch.")
     except HqpGraspError as error:
         sys.exit(f"hqp_grasp: {error}")
 

@@ -2,7 +2,9 @@
 
 import math
 import operator
+import re
 from collections.abc import Mapping
+from importlib.metadata import requires
 from numbers import Real
 
 import numpy as np
@@ -54,6 +56,29 @@ class SingularTaskError(HqpGraspError, ArithmeticError):
 
 class MissingExtraError(HqpGraspError, ImportError):
     """An optional package is not installed; the message gives the line that installs it."""
+
+
+def requirements() -> dict[str, dict[str, str]]:
+    """What hqp_grasp needs, {extra: {package: requirement}}; the extra "" is what it always needs.
+
+    A requirement is as pip reads it, "viser>=1.1.1".
+    """
+    found: dict[str, dict[str, str]] = {}
+    for line in requires("hqp_grasp") or []:
+        needed, _, marker = line.partition(";")
+        extra = re.search(r"extra == ['\"](.+?)['\"]", marker)
+        package = re.split(r"[^\w.-]", needed.strip(), maxsplit=1)[0]
+        found.setdefault(extra[1] if extra else "", {})[package] = needed.strip()
+    return found
+
+
+def missing(extra: str, package: str, whose: str = "this") -> MissingExtraError:
+    """The error for a package that an extra brings and that is not installed.
+
+    Its line installs the extra's own requirements, so it works wherever hqp_grasp came from.
+    """
+    needed = " ".join(f"'{each}'" for each in requirements()[extra].values())
+    return MissingExtraError(f"{whose} needs {package}: pip install {needed}")
 
 
 def number(name: str, value: object) -> float:

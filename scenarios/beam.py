@@ -1,7 +1,7 @@
 """A beam of 10 × 60 × 10 cm, which two palms grasp at its ends by touch.
 
-python scenarios/beam.py --help
-python scenarios/beam.py --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
+hqp-grasp run beam --help
+hqp-grasp run beam --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

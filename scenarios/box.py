@@ -1,8 +1,8 @@
 """A box of 30 × 40 × 30 cm, its long side between the two arms that grasp it by touch.
 
-python scenarios/box.py --help
-python scenarios/box.py --hand both --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
-python scenarios/box.py --hand palms --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
+hqp-grasp run box --help
+hqp-grasp run box --hand both --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
+hqp-grasp run box --hand palms --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

@@ -1,7 +1,7 @@
 """The paper's first object: a cylinder of 5 cm radius, grasped by touch.
 
-python scenarios/cylinder.py --help
-python scenarios/cylinder.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2 --out DIR
+hqp-grasp run cylinder --help
+hqp-grasp run cylinder --stack fmk --trials 40 --probes 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

@@ -1,6 +1,6 @@
 """The cylinder of the paper's experiment on the robot: 6.5 cm radius, grasped by touch.
 
-python scenarios/cylinder_65.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2 --out DIR
+hqp-grasp run cylinder_65 --stack fmk --trials 40 --probes 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

@@ -1,8 +1,8 @@
 """A drum of 20 cm radius, too wide for one hand: two arms grasp it by touch.
 
-python scenarios/drum.py --help
-python scenarios/drum.py --hand both --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
-python scenarios/drum.py --hand palms --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
+hqp-grasp run drum --help
+hqp-grasp run drum --hand both --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
+hqp-grasp run drum --hand palms --stack fm --trials 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

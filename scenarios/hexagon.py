@@ -1,6 +1,6 @@
 """The paper's second object: a regular hexagon with sides of 6 cm, grasped by touch.
 
-python scenarios/hexagon.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2 --out DIR
+hqp-grasp run hexagon --stack fmk --trials 40 --probes 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

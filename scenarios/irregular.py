@@ -1,6 +1,6 @@
 """The paper's third kind of object: an irregular prism of six sides.
 
-python scenarios/irregular.py --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2 --out DIR
+hqp-grasp run irregular --stack fmk --trials 40 --probes 40 --seed 0 --jobs 2 --out DIR
 """
 
 import hqp_grasp as hg

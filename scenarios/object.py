@@ -1,6 +1,6 @@
 """An object read from a file, an MJCF or a mesh: no Python needed.
 
-python scenarios/object.py --object FILE --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2
+hqp-grasp run object --object FILE --stack fmk --trials 40 --probes 40 --seed 0 --jobs 2
 """
 
 import sys
@@ -36,5 +36,5 @@ class Arguments:
 
 
 if __name__ == "__main__":
-    arguments = tyro.cli(Arguments, prog="object.py", description=__doc__)
+    arguments = tyro.cli(Arguments, prog="hqp-grasp run object", description=__doc__)
     main(f"object-{arguments.object.stem}", arguments.scene, arguments.settings)

@@ -1,6 +1,6 @@
 """An upright prism over any convex outline, read from a file: no Python needed.
 
-python scenarios/prism.py --corners FILE --stack fmk --trials 40 --probes 60 --seed 0 --jobs 2
+hqp-grasp run prism --corners FILE --stack fmk --trials 40 --probes 40 --seed 0 --jobs 2
 """
 
 from dataclasses import dataclass
@@ -41,5 +41,5 @@ class Arguments:
 
 
 if __name__ == "__main__":
-    arguments = tyro.cli(Arguments, prog="prism.py", description=__doc__)
+    arguments = tyro.cli(Arguments, prog="hqp-grasp run prism", description=__doc__)
     main(f"prism-{arguments.corners.stem}", arguments.scene, arguments.settings)

@@ -34,6 +34,7 @@ POSTURE.set_target(CONFIGURATION.q)
 CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.AlignTask: {},
     hg.Body: {"file": "robots/bhand/bhand.xml"},
+    hg.ClearanceLimit: {"robot": ROBOT},
     hg.ClippedForm: {},
     hg.ConfigurationLimit: {"robot": ROBOT},
     hg.Contact: CONTACT,
@@ -67,6 +68,12 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.Missed: {"reason": hg.Miss.STUCK, "where": "finger"},
     hg.MomentTask: {},
     hg.Noise: {},
+    hg.NoisyProbe: {
+        "probe": hg.GeometricProbe(SCENE),
+        "robot": ROBOT,
+        "noise": hg.Noise(),
+        "rng": np.random.default_rng(0),
+    },
     hg.PaperForm: {},
     hg.PhysicalProbe: {"driver": HAND, "robot": ROBOT},
     hg.Physics: {},
@@ -83,6 +90,13 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
         "touched": np.zeros(3, dtype=bool),
         "stalled": np.zeros(3, dtype=bool),
     },
+    hg.Rig: {
+        "driver": HAND,
+        "robot": ROBOT,
+        "free": np.zeros((2, 4)),
+        "open": np.zeros(4),
+        "normals": np.eye(3),
+    },
     hg.Robot: {"description": ROBOT.description, "model": SCENE.model},
     hg.RobotDescription.load: {"robot": "bhand"},
     hg.Scene: {"robot": "bhand"},
@@ -94,6 +108,7 @@ CALLS: dict[Callable[..., Any], dict[str, Any]] = {
     hg.Touch: {"q_target": np.zeros(2), "felt": hg.Grasp(**GRASP)},
     hg.Trial: {"scene": SCENE, "stack": STACK},
     hg.VelocityLimit: {"velocity": np.ones(2), "dt": 0.1},
+    hg.form_of: {"name": "hierarchy"},
     hg.sense: {"wrench": np.array([1.0, 0, 0, 0, 0, 0]), "tip": 0.01},
     hg.solve_ik: {
         "configuration": CONFIGURATION,
@@ -110,6 +125,7 @@ ANSWERS = {  # what the package hands out, and what is abstract
         "Driver",
         "Felt",
         "ForceLaw",
+        "Form",
         "GRIP_LAWS",
         "Judged",
         "Lift",
@@ -124,6 +140,7 @@ ANSWERS = {  # what the package hands out, and what is abstract
         "Record",
     ),
     *("Solution", "Step", "Task", "ik_levels", "load_history", "save_history", "solvers"),
+    "check_driver",  # needs one to try: tests/touch/test_driver.py
     "lift",  # needs a hand that holds: tests/experiments/test_pick.py
 }
 NO_NUMBER = ("0.05", True, 1j, [0.05], object(), b"1", {})
@@ -259,6 +276,7 @@ def test_a_scene_of_numpys_numbers_is_saved_and_read(tmp_path):
 # What is taken where nothing is given; what else has no default, or one that says nothing.
 DEFAULTS = {
     hg.Body: {"scale": 1.0},
+    hg.ClearanceLimit: {"within": 0.04},
     hg.Contact: {"name": "", "point": None, "flexion": (), "tip_radius": 0.0, "noise": 0.0},
     hg.Controller: {"form": "hierarchy", "budget": None, "landing": True},
     hg.Cylinder: {"height": 0.12},

@@ -3,7 +3,6 @@
 import contextlib
 import io
 import re
-import runpy
 import shlex
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import hqp_grasp as hg
+from hqp_grasp.__main__ import main
 from hqp_grasp.experiments.study import _run_one
 
 ROOT = Path(__file__).parents[1]
@@ -56,7 +56,6 @@ COMMANDS_ON = [
     "results.md",
 ]
 SMALL = ["--probes", "2", "--jobs", "1"]  # in the place of what the page says, and so few trials
-ELSEWHERE = ("benchmarks/", "pytest", "ruff")  # what `make results`, `make test` run
 
 
 def commands(script):
@@ -66,32 +65,26 @@ def commands(script):
 
 
 def calls(page):
-    """The page's calls of hqp_grasp and of scenarios, each by its arguments after `python`."""
+    """The page's calls of hqp-grasp, each by its arguments."""
     found = [w for kind, _, code, _ in BLOCKS[page] if kind == "sh" for w in commands(code)]
-    python = [w[1:] for w in found if w[0] in ("python", ".venv/bin/python")]
-    python = [w for w in python if "--cluster" not in w]  # `make test-all` starts clusters
-    return [w for w in python if not any(part in " ".join(w[:2]) for part in ELSEWHERE)]
+    own = [w[1:] for w in found if w[0] == "hqp-grasp"]
+    return [w for w in own if "--cluster" not in w]  # `make test-all` starts clusters
 
 
 def call(arguments, monkeypatch):
-    """Do in this process what `python ARGUMENTS` does, with few and short trials."""
-    if arguments[0] == "-m":
-        module, arguments = arguments[1], arguments[2:]
-    else:
-        module = "hqp_grasp." + arguments[0].removesuffix(".py").replace("/", ".")
-        arguments = arguments[1:]
-    if module != "hqp_grasp" or arguments[0] in ("run", "pick"):
+    """Do in this process what `hqp-grasp ARGUMENTS` does, with few and short trials."""
+    if arguments[0] in ("run", "pick"):
         trials = "8" if "--replay" in arguments else "2"
         arguments = [*arguments, *SMALL, "--trials", trials]
     elif arguments[0] == "view":
         arguments = [*arguments, "--port", "0"]
     elif arguments[0] == "judge":
         arguments = [*arguments, "--jobs", "1"]
-    monkeypatch.setattr(sys, "argv", [module, *arguments])
-    started = ("hqp_grasp.__main__", "hqp_grasp.scenarios.")
-    for name in [name for name in sys.modules if name.startswith(started)]:
+    monkeypatch.setattr(sys, "argv", ["hqp-grasp", *arguments])
+    for name in [name for name in sys.modules if name.startswith("hqp_grasp.scenarios.")]:
         monkeypatch.delitem(sys.modules, name)  # a command starts afresh
-    runpy.run_module(module, run_name="__main__")
+    with contextlib.suppress(SystemExit) if "--help" in arguments else contextlib.nullcontext():
+        main()
 
 
 def interrupted(viewer):
@@ -154,9 +147,11 @@ def test_make_knows_what_a_page_has_it_make(page):
             subprocess.run([*words, "--dry-run"], cwd=ROOT, check=True, capture_output=True)
 
 
-def test_nothing_but_python_make_pip_and_dask_is_shown_as_a_command():
+def test_nothing_but_hqp_grasp_python_make_pip_and_dask_is_shown_as_a_command():
     found = [w for p in BLOCKS for k, _, code, _ in BLOCKS[p] if k == "sh" for w in commands(code)]
-    assert {words[0] for words in found} <= {"make", "python", ".venv/bin/python", "pip", "dask"}
+    assert {words[0] for words in found} <= {
+        *("hqp-grasp", "make", "python", ".venv/bin/python", "pip", "dask")
+    }
 
 
 # A unit on the page, and how the metadata of a column begins.

@@ -3,22 +3,30 @@
 import dataclasses
 import inspect
 import io
+import platform
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 import hqp_grasp as hg
 from hqp_grasp.__main__ import judge, main, view
+from hqp_grasp.errors import requirements
 from hqp_grasp.experiments.picking import PickSettings
 from hqp_grasp.experiments.scenario import Settings
+
+ROOT = Path(__file__).parents[1]
 
 
 def call(monkeypatch, *arguments):
     for name in [name for name in sys.modules if name.startswith("hqp_grasp.scenarios.")]:
         monkeypatch.delitem(sys.modules, name)  # as in a process of its own
-    monkeypatch.setattr(sys, "argv", ["hqp_grasp", *map(str, arguments)])
+    monkeypatch.setattr(sys, "argv", ["hqp-grasp", *map(str, arguments)])
     main()
 
 
@@ -88,6 +96,59 @@ def test_every_command_speaks_to_any_terminal(monkeypatch, tmp_path, results, en
         assert "force ▷ moment ▷ kinematic" in said
     elif arguments[0] == "run" and len(arguments) > 3:
         assert "force > moment > kinematic" in said
+
+
+def test_the_version_is_the_package_s_own(monkeypatch, capsys):
+    call(monkeypatch, "--version")
+    assert capsys.readouterr().out == f"hqp_grasp {hg.__version__}\n"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert hg.__version__ == project["version"]
+    assert project["scripts"] == {"hqp-grasp": "hqp_grasp.__main__:main"}
+
+
+@pytest.mark.parametrize("scenario", ["cylinder", "prism", "object"])
+@pytest.mark.parametrize("command", ["run", "pick"])
+def test_help_names_the_command_that_was_typed(monkeypatch, capsys, command, scenario):
+    with pytest.raises(SystemExit):
+        call(monkeypatch, command, scenario, "--help")
+    said = capsys.readouterr().out
+    assert said.startswith(f"usage: hqp-grasp {command} {scenario} [-h]")
+    assert ".py" not in said and "--probes 60" not in said
+
+
+def test_the_doctor_tells_versions_and_what_is_missing_and_that_the_solver_works(
+    monkeypatch, capsys
+):
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    extra = {"view": {"viser": "viser>=1.1.1", "no-such-viewer": "no-such-viewer>=2"}}
+    found = {"": {"numpy": "numpy>=2.0"}} | extra
+    monkeypatch.setattr("hqp_grasp.experiments.doctor.requirements", lambda: found)
+    call(monkeypatch, "doctor")
+    said = dict(line.strip().split(maxsplit=1) for line in capsys.readouterr().out.splitlines()
+                if " " in line.strip())  # fmt: skip
+    assert said["hqp_grasp"].startswith(f"{hg.__version__}, ")
+    assert said["python"].startswith(platform.python_version())
+    assert said["needs"] == f"numpy {np.__version__}"
+    assert said["view"].endswith("missing: pip install 'no-such-viewer>=2'")
+    assert "compiled" in said["solver"] and "kept in" in said["solver"]
+    assert said["browser"].startswith("no chromium") and "EGL" in said["renderer"]
+
+
+def test_requirements_are_read_by_extra_as_pyproject_has_them():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    stated = {"": project["dependencies"]} | project["optional-dependencies"]
+    found = {extra: list(needed.values()) for extra, needed in requirements().items()}
+    assert found == stated
+    assert set(requirements()["bench"]) == {"clarabel", "pin-pink"}
+
+
+def test_no_command_is_spelled_in_another_way():
+    texts = [ROOT / "README.md", ROOT / "Makefile", *ROOT.glob("docs/*.md")]
+    texts += [
+        p for room in ("hqp_grasp", "scenarios", "benchmarks") for p in ROOT.glob(f"{room}/**/*.py")
+    ]
+    old = re.compile(r"-m hqp_grasp(\.scenarios|\s+\w)|(python|PY\)) scenarios/")
+    assert [p.name for p in texts if old.search(p.read_text(encoding="utf-8"))] == []
 
 
 def defaults(command):

@@ -168,6 +168,14 @@ def test_the_reference_has_all_that_is_exported(site):
     assert sorted(found) == sorted(hg.__all__)
 
 
+def test_the_reference_begins_with_a_line_for_each_name_that_is_exported(site):
+    page = (site / "reference/index.html").read_text(encoding="utf-8")
+    lines = dict(re.findall(r"<li><a [^>]*><code>(\w+)</code></a>: (\S.*?)</li>", page))
+    assert sorted(lines) == sorted(hg.__all__)
+    assert lines["Missed"] == "A probe that brought no grasp."
+    assert lines["GRIP_LAWS"] != lines["Forces"] and len(set(lines.values())) == len(lines)
+
+
 def test_the_reference_tells_shapes_and_units_that_stand_beside_fields(site):
     page = (site / "reference/grasp.html").read_text(encoding="utf-8")
     assert "<li><code>position</code>: (3,) [m], world</li>" in page

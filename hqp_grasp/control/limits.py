@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hqp_grasp.errors import InputError, instance, number, positive
+from hqp_grasp.errors import InputError, instance, not_negative, number, positive
 from hqp_grasp.grasp import Grasp, as_array
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.tasks import Stack
@@ -113,6 +113,8 @@ class ClearanceLimit(Limit):
     _links: SelfClearance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        instance("ClearanceLimit.robot", self.robot, Robot)
+        object.__setattr__(self, "within", not_negative("ClearanceLimit.within", self.within))
         links = SelfClearance(self.robot, self.robot.description.clearance)
         object.__setattr__(self, "_links", links)
 

@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from hqp_grasp.errors import InputError, MissingExtraError, WorkerError
+from hqp_grasp.errors import InputError, WorkerError, missing
 from hqp_grasp.experiments.fingerprint import Fingerprint, differences
 from hqp_grasp.hierarchy.compiled import Turn, take_turns
 
@@ -409,9 +409,7 @@ def need(package: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
-        raise MissingExtraError(
-            f"a cluster needs {package}: pip install 'hqp_grasp[cluster]'"
-        ) from error
+        raise missing("cluster", package, "a cluster") from error
 
 
 def tell(message: str) -> None:

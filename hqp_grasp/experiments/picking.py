@@ -60,7 +60,7 @@ def main(name: str) -> None:
     """Pick the object of a scenario as the command line says."""
     module = importlib.import_module(f"hqp_grasp.scenarios.{name}")
     about = f"Find {name} by touch, hold it, lift it, shake it and set it down where it stood."
-    prog = f"python -m hqp_grasp pick {name}"
+    prog = f"hqp-grasp pick {name}"
     if hasattr(module, "Arguments"):  # an object from a file, with settings among its arguments
         with_settings: Any = dataclasses.make_dataclass(
             "Arguments",

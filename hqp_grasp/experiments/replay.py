@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from hqp_grasp.errors import InputError, MissingExtraError, ResultsError
+from hqp_grasp.errors import InputError, ResultsError, missing
 from hqp_grasp.experiments.plots import ANGLE, FLOOR, FORCE, MOMENT
 from hqp_grasp.experiments.record import (
     CONTACT_COLUMNS,
@@ -410,7 +410,7 @@ def _need(package: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != package:
             raise
-        raise MissingExtraError(f"this needs {package}: pip install 'hqp_grasp[view]'") from error
+        raise missing("view", package) from error
 
 
 def light(scene_api: Any) -> None:

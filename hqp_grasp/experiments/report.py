@@ -158,7 +158,7 @@ def report(folders: Sequence[str | Path]) -> str:
             for outcome in failed[:SHOWN]:
                 rows.append(
                     f"{kind}: trial {outcome.trial} of seed {outcome.seed}: "
-                    f"python -m hqp_grasp view {name} --trial {outcome.trial}"
+                    f"hqp-grasp view {name} --trial {outcome.trial}"
                 )
             if len(failed) > SHOWN:
                 rest = ", ".join(str(outcome.trial) for outcome in failed[SHOWN:])

@@ -1,4 +1,4 @@
-"""What a robot's description amounts to, in words and as a picture: python -m hqp_grasp robot."""
+"""What a robot's description amounts to, in words and as a picture: hqp-grasp robot."""
 
 from __future__ import annotations
 

@@ -127,7 +127,9 @@ def main(name: str, scene: Scene | Callable[[], Scene], settings: Settings | Non
     speak_plainly()
     try:
         scene = scene if isinstance(scene, Scene) else scene()
-        chosen = settings or tyro.cli(Settings, prog=f"{name}.py", description=_about(name, scene))
+        chosen = settings or tyro.cli(
+            Settings, prog=f"hqp-grasp run {name}", description=_about(name, scene)
+        )
         run(name, scene, chosen)
         if chosen.view:
             serve(_out(name, chosen), port=chosen.port)

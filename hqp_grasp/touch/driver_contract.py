@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hqp_grasp.errors import HqpGraspError, InputError
+from hqp_grasp.errors import HqpGraspError, InputError, instance
 from hqp_grasp.grasp import as_array
-from hqp_grasp.touch.driver import PRESS_RATE, Driver, Readings
+from hqp_grasp.touch.driver import PRESS_RATE, TOUCHING, Driver, Readings
 from hqp_grasp.touch.physical import payload, weight
 from hqp_grasp.touch.sensing import sense
 from hqp_grasp.world.robot import Robot
@@ -79,6 +79,9 @@ class Rig:
     _names: tuple[str, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        instance("Rig.robot", self.robot, Robot)
+        if not any(hasattr(self.driver, call) for call in TOUCHING):
+            raise InputError(f"Rig.driver must have the calls of a Driver; got {self.driver!r}")
         n, k = self.robot.n, len(self.robot.flexion)
         for name, shape in (("free", (None, n)), ("open", (n,)), ("normals", (k, 3))):
             array = as_array(f"Rig.{name}", getattr(self, name), shape)
@@ -170,6 +173,7 @@ def _missing(duration: float, got: int, rate: float) -> str:
 
 def check_driver(rig: Rig) -> None:
     """Run every check of CHECKS; raise DriverError with all that was found, first things first."""
+    instance("rig", rig, Rig)
     faults = []
     for check in CHECKS:
         try:

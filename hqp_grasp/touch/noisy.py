@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hqp_grasp.errors import not_negative
+from hqp_grasp.errors import InputError, instance, not_negative
 from hqp_grasp.grasp import Contact, Grasp, Missed
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.world.robot import Robot
@@ -37,6 +37,13 @@ class NoisyProbe:
     noise: Noise
     rng: np.random.Generator
     felt: list[Grasp | Missed] = field(default_factory=list)  # each touch as it is, no noise on it
+
+    def __post_init__(self) -> None:
+        if not callable(getattr(self.probe, "touch", None)):
+            raise InputError(f"NoisyProbe.probe must have a method touch; got {self.probe!r}")
+        instance("NoisyProbe.robot", self.robot, Robot)
+        instance("NoisyProbe.noise", self.noise, Noise)
+        instance("NoisyProbe.rng", self.rng, np.random.Generator)
 
     def touch(self, q_target: np.ndarray) -> Grasp | Missed:
         """Touch at q_target (n,) [rad], and return the grasp as it is felt."""

@@ -22,9 +22,22 @@ from hqp_grasp.world.robot import Robot, compiled, described
 CAN = Cylinder(radius=0.05)  # the paper's first object
 
 
+class _Name(str):
+    """A robot's name, which says where the robot is when it is taken for it."""
+
+    def __getattr__(self, name: str) -> object:
+        raise AttributeError(
+            f"Scene.robot is the name that the scene was given, {str(self)!r}, and has no "
+            f"{name!r}; the robot is scene.articulated"
+        )
+
+
 @dataclass(frozen=True)
 class Scene:
     """A robot and an object that stands still, its middle at `position`.
+
+    `robot` stays what was given, a name or a path; the robot itself is `articulated`. An object
+    given by the path of a file is the Body of that file.
 
     Without a position it stands in the robot's workspace, and the robot's first hand grasps it.
     `base` moves the robot away from where its model puts it: a hand without an arm is placed so.
@@ -37,9 +50,16 @@ class Scene:
     hand: str | None = None  # of a robot with several
 
     def __post_init__(self) -> None:
+        if isinstance(self.robot, str):
+            object.__setattr__(self, "robot", _Name(self.robot))
+        if isinstance(self.object, Path) or (
+            isinstance(self.object, str) and Path(self.object).suffix
+        ):
+            object.__setattr__(self, "object", Body(self.object))
         if not isinstance(self.object, Cylinder | Prism | Body):
             raise InputError(
-                f"unknown object {self.object!r}; choose one of: Cylinder, Prism, Body"
+                f"unknown object {self.object!r}; choose one of: Cylinder, Prism, Body, or the "
+                "path of a file"
             )
         description = described(self.robot, self.hand)
         object.__setattr__(self, "_description", description)

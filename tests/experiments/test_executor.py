@@ -175,7 +175,7 @@ def test_a_file_that_no_scheduler_wrote_is_said(text, tmp_path):
 def test_without_dask_the_line_that_installs_it_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "dask", None)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'hqp_grasp\[cluster\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'distributed>=2025.1'$"):
         list(run_all(Square(), range(3), cluster="tcp://127.0.0.1:8786"))
 
 

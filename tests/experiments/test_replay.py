@@ -383,7 +383,7 @@ def test_importing_hqp_grasp_needs_no_viewer():
 
 def test_without_viser_the_line_that_installs_it_is_given(record, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'hqp_grasp\[view\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'viser>=1.1.1'$"):
         write_replay(SCENE, record, tmp_path / "replay.html")
     assert not list(tmp_path.iterdir())
 
@@ -397,7 +397,7 @@ def test_a_scenario_without_viser_ends_as_before(tmp_path, monkeypatch, capsys):
     table = scenario.run("cylinder", SCENE, settings)
     said = capsys.readouterr().out
     assert table.num_rows == 8 and (tmp_path / "convergence.png").is_file()
-    assert "pip install 'hqp_grasp[view]'" in said.splitlines()[-1]
+    assert "pip install 'viser>=1.1.1'" in said.splitlines()[-1]
     assert not (tmp_path / "replay.html").exists()
 
 

@@ -151,7 +151,7 @@ def test_a_report_counts_pairs_and_names_who_failed(tmp_path):
     said = report([one, other])
     assert f"{one}" in said and "3 [" in said and "5 [" in said
     assert f"{other} against {one}, 5 pairs: good +40.0%" in said
-    assert f"lost: trial 3 of seed 5: python -m hqp_grasp view {one} --trial 3" in said
+    assert f"lost: trial 3 of seed 5: hqp-grasp view {one} --trial 3" in said
     assert "2 (2.98, 3)" in said  # probes to balance
 
 

@@ -298,7 +298,7 @@ def test_a_port_in_use_is_said_and_no_other_is_taken(folders):
 
 def test_without_viser_the_line_that_installs_it_is_given(folders, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'hqp_grasp\[view\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'viser>=1.1.1'$"):
         serve(folders / "strict")
     settings = scenario.Settings(trials=1, probes=1, view=True, out=tmp_path / "out")
     with pytest.raises(MissingExtraError):  # before any work
