@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from hqp_grasp.mechanics import tangents
 from hqp_grasp.surface.felt import SLACK, Felt, gaps
 from hqp_grasp.surface.supported import Supported
 
-SOFTNESS = (1e-3, 2e-4, 2e-5)  # [m] by which the hull's edges are rounded, ever less
 NEGLECTED = 16.0  # [–] times the softness that a body's support is less than the hull's
 
 
@@ -32,7 +30,7 @@ class Rounded(Supported):
     points: np.ndarray  # x (N, 3) [m] felt, world
     middles: np.ndarray  # c (N, 3) [m] of the ellipsoids
     shapes: np.ndarray  # Q (N, 3, 3) [m²]
-    softness: float = SOFTNESS[-1]  # [m]
+    softness: float = 2e-5  # [m] by which the hull's edges are rounded
 
     @classmethod
     def of(cls, felt: Felt) -> Rounded:
@@ -48,9 +46,6 @@ class Rounded(Supported):
 
     def support(self, u: np.ndarray) -> np.ndarray:
         return self.curved(u)[0]
-
-    def smoother(self) -> Sequence[Supported]:
-        return [replace(self, softness=v) for v in SOFTNESS if v > self.softness]
 
     def doubt(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(np.linalg.norm(x[:, None] - self.points, axis=-1).min(axis=1))

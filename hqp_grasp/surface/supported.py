@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hqp_grasp.grasp import Grasp
-from hqp_grasp.surface.surface import APART, DISTINCT, distinct, unit
+from hqp_grasp.surface.surface import distinct, unit
 
 STARTS = (300, 24)  # rotations from which balance is sought: anywhere, and near the grasp
 DOUBT_WORTH = 0.5  # [–] m of way for which 1 m from what was felt is taken
@@ -41,10 +40,6 @@ class Supported(ABC):
             bend[:, :, j] = (self.support(ahead) - self.support(behind)) / (2.0 * step)
         return self.support(u), bend
 
-    def smoother(self) -> Sequence[Supported]:
-        """Surfaces ever less smooth, on which to seek balance before it is sought on this one."""
-        return ()
-
     def doubt(self, x: np.ndarray) -> np.ndarray:
         """How far (m,) [m] points x (m, 3) of the surface are from what is known for sure."""
         return np.zeros(len(x))
@@ -69,59 +64,31 @@ class Supported(ABC):
     def ways(self, grasp: Grasp) -> list[WayOver]:
         """Ways that differ to where unit forces along the normals balance, the cheapest first."""
         e = zero_sum(grasp.normals)
-        R = _starts(e, grasp.normals)
-        for surface in (*self.smoother(), self):
-            R = _balanced(surface, R, e)
-            cost, centers = _costs(surface, grasp, R @ e.T)
-            order = distinct(cost, centers, 4 * DISTINCT, 0.1 * APART)
-            R = R[order]
-        cost, centers = _costs(self, grasp, R @ e.T)
-        order = distinct(cost, centers)
-        return [WayOver.over(self, grasp, (R[i] @ e.T).T, float(cost[i])) for i in order]
+        R = _balanced(self, _starts(e, grasp.normals), e)
+        u = R @ e.T
+        cost, centers = _costs(self, grasp, u)
+        chosen = distinct(cost, centers)
+        return [WayOver(grasp, centers[i], u[i].T, float(cost[i])) for i in chosen]
 
 
 @dataclass(frozen=True, eq=False)
 class WayOver:
-    """Over the surface, from where contacts are to where they should be.
+    """Straight from where contacts are to where they should be; normals turn by great circles."""
 
-    Each normal turns along a great circle, by equal lengths of its tip's way in equal shares.
-    """
-
+    grasp: Grasp
+    centers: np.ndarray  # (k, 3) [m] where the tips' centres should be, world
+    normals: np.ndarray  # (k, 3) there
     cost: float  # [m²]
-    length: np.ndarray  # (k, S) share of the way where each contact is at a place below
-    centers: np.ndarray  # (k, S, 3) [m], world
-    normals: np.ndarray  # (k, S, 3)
-
-    @classmethod
-    def over(cls, surface: Supported, grasp: Grasp, to: np.ndarray, cost: float) -> WayOver:
-        """The way from a grasp to where its normals are `to` (k, 3), which costs `cost` [m²]."""
-        k, n = grasp.k, grasp.normals
-        share = np.linspace(0.0, 1.0, 25)
-        angle = np.arctan2(np.linalg.norm(np.cross(n, to), axis=1), (n * to).sum(axis=1))
-        aside = to - (n * to).sum(axis=1)[:, None] * n
-        aside = aside / np.maximum(np.linalg.norm(aside, axis=1), np.finfo(float).tiny)[:, None]
-        t = angle[:, None] * share
-        normals = np.cos(t)[..., None] * n[:, None] + np.sin(t)[..., None] * aside[:, None]
-        rho = np.array([c.tip_radius for c in grasp.contacts])[:, None, None]
-        centers = surface.support(normals.reshape(-1, 3)).reshape(k, -1, 3) + rho * normals
-        centers[:, 0] = grasp.centers
-        far = np.linalg.norm(np.diff(centers, axis=1), axis=-1)
-        done = np.cumsum(far, axis=1)
-        done = np.concatenate([np.zeros((k, 1)), done], axis=1)
-        all_of_it = done[:, -1:]
-        length = np.where(all_of_it > 0.0, done / np.where(all_of_it > 0.0, all_of_it, 1.0), share)
-        return cls(cost, length, centers, normals)
 
     def at(self, share: float) -> tuple[np.ndarray, np.ndarray]:
         """The tips' centres (k, 3) [m] and the normals (k, 3) after a share of the way, world."""
-        places = np.concatenate([self.centers, self.normals], axis=-1)
-        there = np.array(
-            [
-                [np.interp(share, length, v) for v in place.T]
-                for length, place in zip(self.length, places, strict=True)
-            ]
-        )
-        return there[:, :3], unit(there[:, 3:])
+        n, c = self.grasp.normals, self.grasp.centers
+        cosine = (n * self.normals).sum(axis=1)[:, None]
+        aside = self.normals - cosine * n
+        sine = np.linalg.norm(aside, axis=1)[:, None]
+        t = share * np.arctan2(sine, cosine)
+        after = np.cos(t) * n + np.sin(t) * aside / np.maximum(sine, np.finfo(float).tiny)
+        return c + share * (self.centers - c), unit(after)
 
 
 def zero_sum(normals: np.ndarray) -> np.ndarray:

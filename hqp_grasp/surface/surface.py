@@ -51,15 +51,13 @@ def spread(count: int) -> np.ndarray:
     return np.column_stack([ring * np.cos(turn), ring * np.sin(turn), z])
 
 
-def distinct(
-    cost: np.ndarray, places: np.ndarray, many: int = DISTINCT, apart: float = APART
-) -> list[int]:
-    """The cheapest, at most `many`, each with a place (C, k, d) [m] `apart` from the others'."""
+def distinct(cost: np.ndarray, places: np.ndarray) -> list[int]:
+    """The cheapest, each with a place (C, k, d) [m] apart from the others'."""
     left = np.ones(len(cost), dtype=bool)
     chosen: list[int] = []
-    while left.any() and len(chosen) < many:
+    while left.any() and len(chosen) < DISTINCT:
         i = int(np.argmin(np.where(left, cost, np.inf)))
-        left &= np.linalg.norm(places - places[i], axis=-1).max(axis=1) > apart
+        left &= np.linalg.norm(places - places[i], axis=-1).max(axis=1) > APART
         chosen.append(i)
     return chosen
 
