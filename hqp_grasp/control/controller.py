@@ -112,7 +112,7 @@ class Controller:
         if episode.left is not None and episode.left <= 0:
             return Step(None, reason=f"the budget of {self.budget} touches is spent")
         if grasp is None:
-            return self._search(history[0].q_target, policy.direction(misses))
+            return self._search(history[0].q_target, policy.direction(misses), misses[-1])
         if policy.spent(misses):
             last = misses[-1]
             why = f"{last.reason.value} ({last.where})"
@@ -151,13 +151,17 @@ class Controller:
             palm = f"palm {groups[g].name}" if len(groups) > 1 else "palm"
             yield f"{palm} back by {1e3 * distance:g} mm"
 
-    def _search(self, q: np.ndarray, way: np.ndarray | None) -> Step:
-        """The first touch, sent to q (n,) [rad], again, with the palm moved by `way` (3,) [m]."""
+    def _search(self, q: np.ndarray, way: np.ndarray | None, missed: Missed) -> Step:
+        """The first touch, sent to q (n,) [rad], again; the palm that missed goes `way` (3,) [m].
+
+        Palms of other groups stay.
+        """
         if way is not None and not way.any():
             return Step(q, reason="the same again")
         if way is None or not self.robot.arm:
             return Step(None, reason="no touch has felt a grasp: begin where the hand touches")
-        postures = carried(self.robot, np.clip(q, *self._ranges), way)
+        group = self.robot.group_of(missed.where)
+        postures = carried(self.robot, np.clip(q, *self._ranges), way, group)
         if postures is None:
             return Step(q, reason="the same again: the arm cannot go beside")
         q = np.clip(postures[-1], *self._ranges)

@@ -54,19 +54,21 @@ def reach(
     return None
 
 
-def carried(robot: Robot, q: np.ndarray, by: np.ndarray) -> list[np.ndarray] | None:
-    """Postures (n,) [rad] along which the arm moves the palm straight by `by` (3,) [m], world.
+def carried(
+    robot: Robot, q: np.ndarray, by: np.ndarray, group: int = 0
+) -> list[np.ndarray] | None:
+    """Postures (n,) [rad] along which an arm moves its palm straight by `by` (3,) [m], world.
 
     The hand keeps its joints, the palm its orientation; an arm with joints to spare moves them as
     little as it can. None where it cannot go all the way.
     """
-    p_palm, R_palm = robot.palm(q)
-    hand = [j for j in range(robot.n) if j not in robot.arm]
+    p_palm, R_palm = robot.palm(q, group)
+    hand = [j for j in range(robot.n) if j not in robot.groups[group].arm]
     count = max(1, int(np.ceil(np.linalg.norm(by) / APART)))
     way: list[np.ndarray] = []
     for share in np.arange(1, count + 1) / count:
         start = way[-1] if way else q
-        found = reach(robot, start, p_palm + share * by, R_palm, hand, homing=0.0)
+        found = reach(robot, start, p_palm + share * by, R_palm, hand, 0.0, group)
         if found is None:
             return None
         way.append(found)

@@ -431,14 +431,16 @@ class Camera:
 
 
 def camera(scene: Scene, q: np.ndarray) -> Camera:
-    """A view of hand and object from the side."""
-    thing = np.array(scene.position)
-    palm, _ = scene.articulated.palm(q)
+    """A view of hands and object from the side."""
+    thing, robot = np.array(scene.position), scene.articulated
+    palms = np.array([robot.palm(q, g)[0] for g in range(len(robot.groups))])
     back = VIEW_FROM / np.linalg.norm(VIEW_FROM)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
-    size = max(0.3, 2.0 * float(np.linalg.norm(palm - thing)))
-    return Camera(0.5 * (thing + palm), size, np.array([right, np.cross(back, right), back]))
+    size = max(0.3, 2.0 * float(np.linalg.norm(palms - thing, axis=1).max()))
+    return Camera(
+        0.5 * (thing + palms.mean(axis=0)), size, np.array([right, np.cross(back, right), back])
+    )
 
 
 def aim(server: Any, camera: Camera, aside: float, distance: float = 2.2) -> None:

@@ -59,7 +59,7 @@ class Settings:
     """How to run a scenario; every value has a sensible default."""
 
     stack: str = "fmk"
-    """Laws in their order, one letter each: f (force), m (moment), k (kinematic)."""
+    """Laws in their order, one letter each: f (force), m (moment), k (kinematic), a (align)."""
     trials: int = 40
     """Random starts."""
     probes: int = 40

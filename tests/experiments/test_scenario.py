@@ -356,7 +356,7 @@ def test_help_teaches_every_option_with_its_unit_or_choices(capsys):
     said = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().out).split())
     for option in ("stack", "trials", "probes", "seed", "jobs", "out", "form", "solver", "landing"):
         assert re.search(rf"--{option}[ ,]", said)
-    assert "f (force), m (moment), k (kinematic)" in said
+    assert "f (force), m (moment), k (kinematic), a (align)" in said
     assert "{angle,eq7}" in said and "{hierarchy,memoryless,paper-hierarchy,clipped,paper}" in said
     assert "[rad]" in said and "[m]" in said
     assert "(default: fmk)" in said and "(default: 40)" in said
