@@ -315,6 +315,42 @@ def test_any_number_of_contacts_finds_balance_on_a_cylinder_and_a_hexagon(k):
         np.testing.assert_allclose(ways[0].at(0.0)[0], felt.centers, atol=1e-12)
 
 
+def raised(touch, heights):
+    """The same contacts at these heights (k,) [m]."""
+    felt = touch.felt
+    contacts = tuple(
+        dataclasses.replace(c, position=c.position + z * UP)
+        for c, z in zip(felt.contacts, heights, strict=True)
+    )
+    return Touch(touch.q_target, dataclasses.replace(felt, contacts=contacts))
+
+
+@pytest.mark.parametrize("k", range(2, 9))
+def test_contacts_change_height_by_the_least_that_balances_their_moments(k):
+    rng = np.random.default_rng(k)
+    heights = rng.uniform(-0.05, 0.05, k)
+    touch = raised(on_circle(0.2, *360.0 / k * np.arange(k)), heights)
+    centers, normals = Walls.of(Felt.of([touch], 0.4), UP, TIP).ways(touch.felt)[0].at(1.0)
+    np.testing.assert_allclose(np.cross(normals, centers).sum(axis=0), 0.0, atol=1e-5)
+    change, n = centers[:, 2] - heights, normals[:, :2]
+    # The least change is along what turns the moment, and two or three contacts end level.
+    along = n @ np.linalg.lstsq(n, change, rcond=None)[0]
+    np.testing.assert_allclose(change, along, atol=1e-5)
+    if k <= 3:
+        np.testing.assert_allclose(centers[:, 2], heights.mean(), atol=1e-5)
+
+
+def test_six_contacts_around_a_corner_go_back_to_the_two_faces_they_came_from():
+    half, sides = 0.2, [("side", 1, -0.1), ("side", 1, 0.0), ("side", 1, 0.1)]
+    felt = on_square(half, 0.01, *sides, ("side", 3, 0.12), ("side", 3, -0.05), ("side", 0, -0.19))
+    ways = Walls.of(Felt.of([felt], 0.4), UP, TIP).ways(felt.felt)
+    centers, normals = ways[0].at(1.0)
+    np.testing.assert_allclose(np.abs(normals[:, 1]), 1.0, atol=TURNED)
+    np.testing.assert_allclose(normals.sum(axis=0), 0.0, atol=6 * TURNED)
+    np.testing.assert_allclose(np.cross(normals, centers).sum(axis=0), 0.0, atol=2e-3)
+    assert normals[-1, 1] < 0.0  # to the face beside its own, and there it is the third
+
+
 def test_walls_reach_as_far_as_was_felt():
     walls = Walls.of(Felt.of([on_circle(0.05, 0.0, 120.0, 240.0)]), UP, TIP)
     np.testing.assert_allclose(
