@@ -54,9 +54,7 @@ def reach(
     return None
 
 
-def carried(
-    robot: Robot, q: np.ndarray, by: np.ndarray, group: int = 0
-) -> list[np.ndarray] | None:
+def carried(robot: Robot, q: np.ndarray, by: np.ndarray, group: int = 0) -> list[np.ndarray] | None:
     """Postures (n,) [rad] along which an arm moves its palm straight by `by` (3,) [m], world.
 
     The hand keeps its joints, the palm its orientation; an arm with joints to spare moves them as
