@@ -42,7 +42,7 @@ def paper_levels(stack: Stack, grasp: Grasp) -> list[Level]:
     rest = np.zeros(grasp.n)
     for task in laws(stack):
         if is_kinematic(task):
-            rest -= task.gain * task.gradient(grasp)
+            rest += task.step(grasp)
     return [
         Level.equal(grasp.jacobian, contact_step(stack, grasp), "contact step"),
         Level.equal(np.eye(grasp.n), rest, "kinematic"),

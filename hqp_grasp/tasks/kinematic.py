@@ -8,7 +8,7 @@ from typing import TypeGuard
 import numpy as np
 
 from hqp_grasp.errors import InputError, SingularTaskError, one_of
-from hqp_grasp.grasp import Grasp
+from hqp_grasp.grasp import Contact, Grasp
 from hqp_grasp.tasks.stack import Task
 
 SETTLES = {"gradient": 0.6, "rows": 0.25}  # gain of each form, unless another is given
@@ -38,8 +38,8 @@ class KinematicTask(Task):
     link turns (`Grasp.rolling`) presses no harder for it.
 
     - form="gradient", the default: the paper's dq_c ∝ −∂ε_c/∂q as a level of n rows,
-      x = −gain·∂ε_c/∂q. It fixes every joint, so nothing below it is felt. Here gain has the unit
-      rad²/(unit of ε): rad for "angle", rad³/m for "eq7".
+      x = −gain·∂ε_c/∂q. It fixes every joint, so nothing below it is felt. Here gain
+      has the unit rad²/(unit of ε): rad for "angle", rad³/m for "eq7".
     - form="rows": one Newton row per contact, J_i x = −gain·ε_i, with gain [–], which leaves the
       other joints to laws below. Full steps aim at a zero that most hands cannot reach, and chatter
       about the minimum; a quarter settles.
@@ -100,6 +100,21 @@ class KinematicTask(Task):
         """∂ε_c/∂q (n,) (paper, eq. 9)."""
         return self.jacobian(grasp).sum(axis=0)
 
+    def step(self, grasp: Grasp) -> np.ndarray:
+        """x = −gain·∂ε_c/∂q (n,) [rad], as the paper's form takes it (q̇_c of eq. 13).
+
+        An angle has a kink at zero, where its slope does not fade. One joint hardly ever brings it
+        there; a contact that several joints close does, and would go to and fro about it: it
+        asks for no more than its own Newton step.
+        """
+        several = np.array([_joints(contact) > 1 for contact in grasp.contacts])
+        if self.kind != "angle" or not several.any():
+            return -self.gain * self.gradient(grasp)
+        e, J = self._error_and_jacobian(grasp)
+        square = (J * J).sum(axis=1)
+        newton = e / np.where(square > 0.0, square, 1.0)
+        return -np.where(several, np.minimum(self.gain, newton), self.gain) @ J
+
     def rows(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray]:
         """The equality rows (A, b) asked of x = Δq: see `form` in the class's description."""
         if self.form == "gradient":
@@ -151,6 +166,11 @@ class KinematicTask(Task):
         for way, rows in zip(ways, sets, strict=True):
             way[: len(rows)] = rows
         return ways
+
+
+def _joints(contact: Contact) -> int:
+    """How many joints close a contact that tells it."""
+    return 0 if contact.closing is None else int(np.count_nonzero(contact.closing))
 
 
 def is_kinematic(task: Task) -> TypeGuard[KinematicTask]:

@@ -596,6 +596,23 @@ def test_one_flexion_joint_told_as_a_closing_gives_the_same_bits(seed: int) -> N
         np.testing.assert_array_equal(ask(with_closings(world.grasp, w)), ask(world.grasp))
 
 
+@pytest.mark.parametrize("tilt", [1.0, 0.1, 1e-3, 0.0])
+def test_what_several_joints_close_asks_for_no_more_than_brings_its_angle_to_zero(
+    tilt: float,
+) -> None:
+    """The slope keeps its length down to zero, and so would a step down it."""
+    normal = np.array([math.sin(tilt), 0.0, math.cos(tilt)])
+    J, H = np.zeros((3, 2)), np.zeros((3, 2, 2))
+    J[2] = 0.05
+    H[0, 0, 0] = 0.1  # the first joint turns the way of closing by as much as it turns itself
+    one = one_finger(J, normal, H)
+    both = with_closings(one, {0: np.array([1.0, 1.0])})
+    task = KinematicTask(gain=0.6)
+    np.testing.assert_allclose(task.step(both), [min(0.6, tilt), 0.0], atol=EXACT * 1e2)
+    single = with_closings(one, {0: np.array([0.0, 1.0])})
+    np.testing.assert_array_equal(task.step(single), -0.6 * task.gradient(single))
+
+
 def test_two_equally_fast_joints_have_a_direction_once_it_is_told_how_they_close() -> None:
     J = 0.1 * np.eye(3)[:, :2]
     grasp = one_finger(J, unit(np.array([1.0, 1.0, 0.0])), np.zeros((3, 2, 2)))
