@@ -6,7 +6,6 @@ from scipy.optimize import linprog
 
 from hqp_grasp.errors import InputError
 from hqp_grasp.mechanics import (
-    FLOOR,
     arm,
     ferrari_canny,
     friction_demand,
@@ -17,6 +16,8 @@ from hqp_grasp.mechanics import (
     pyramids,
     tangents,
 )
+
+FLOOR = 0.2
 
 FOUND = 1e-6  # [–] to which friction_demand promises the least µ
 ROUNDING = 1e-12

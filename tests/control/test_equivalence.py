@@ -11,7 +11,10 @@ from problems import Rows, box, equal
 
 import hqp_grasp as hg
 from hqp_grasp import HQP, Level, Projection
-from hqp_grasp.control.forms import SR_DAMPING, TOUCH_RANK, clip_to_limits
+from hqp_grasp.control.forms import clip_to_limits
+
+SR_DAMPING = 1e-05
+TOUCH_RANK = 1e-06
 
 # Two routes to one answer in double precision: 1e-16 times a condition number, which the problems
 # here keep below 1e4, squared at worst (an SR-inverse forms JJᵀ). Asked for is 1e-8.

@@ -7,10 +7,12 @@ import pytest
 
 import hqp_grasp as hg
 from hqp_grasp.control.forces import Squeeze
-from hqp_grasp.control.hold import RELAXING, RESERVE
 from hqp_grasp.errors import InputError
 from hqp_grasp.world.description import RobotDescription
 from hqp_grasp.world.robot import compiled
+
+RELAXING = 0.97
+RESERVE = 0.5
 
 MU = 0.5
 BLIND = hg.Missed(hg.Miss.SENSOR, "finger_1")

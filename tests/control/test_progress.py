@@ -10,11 +10,15 @@ from own_law import HeightTask
 from hqp_grasp.control.episode import Episode
 from hqp_grasp.control.forms import HierarchyForm
 from hqp_grasp.control.limits import StepLimit
-from hqp_grasp.control.progress import BETTER, HOPE, PATIENCE, Progress
+from hqp_grasp.control.progress import Progress
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
-from hqp_grasp.mechanics import SECURE
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask, Stack, stack_of
+
+BETTER = 0.002
+HOPE = 20
+PATIENCE = 3
+SECURE = 0.2
 
 MISSED = Missed(Miss.NO_TOUCH, "finger_1")
 JOINTS = 12

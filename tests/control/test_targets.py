@@ -11,21 +11,27 @@ from hqp_grasp.control.controller import Controller
 from hqp_grasp.control.episode import Episode, MissPolicy
 from hqp_grasp.control.forms import form_of
 from hqp_grasp.control.limits import StepLimit, cap_ratio, room_left
-from hqp_grasp.control.progress import PATIENCE, Progress
+from hqp_grasp.control.progress import Progress
 from hqp_grasp.control.step import fitting, scaled
-from hqp_grasp.control.targets import AWAY, INTO, Target, nearest_free
+from hqp_grasp.control.targets import Target, nearest_free
 from hqp_grasp.experiments.trial import Trial
-from hqp_grasp.grasp import BEYOND, Contact, Grasp, Miss, Missed, Touch
+from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
 from hqp_grasp.history import load_history, save_history
 from hqp_grasp.surface.believed import believed
-from hqp_grasp.surface.felt import CONTRADICTION, Felt
+from hqp_grasp.surface.felt import Felt
 from hqp_grasp.surface.outline import wrapped
 from hqp_grasp.tasks import ForceTask, MomentTask, stack_of
 from hqp_grasp.tasks.limit import Limit, Priority
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
+
+PATIENCE = 3
+AWAY = 0.002
+INTO = 0.2
+BEYOND = 4.0
+CONTRADICTION = 0.0002
 
 TIP = 0.008  # [m]
 HEXAGON = Prism.regular(6, 0.06)

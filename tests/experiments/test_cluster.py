@@ -21,7 +21,9 @@ from deadly import Square, raises
 import hqp_grasp as hg
 from hqp_grasp.errors import WorkerError
 from hqp_grasp.experiments import executor
-from hqp_grasp.experiments.executor import IN_FLIGHT, run_all
+from hqp_grasp.experiments.executor import run_all
+
+IN_FLIGHT = 2
 
 distributed = pytest.importorskip(
     "distributed", reason="no distributed: pip install 'hqp_grasp[cluster]'"

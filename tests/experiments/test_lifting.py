@@ -11,8 +11,9 @@ from hqp_grasp.errors import InputError
 from hqp_grasp.experiments.lifting import lift
 from hqp_grasp.experiments.pick import _apart, _Log, _turned
 from hqp_grasp.touch.driver import DriverLimits
-from hqp_grasp.touch.geometric import RETREAT
 from hqp_grasp.touch.simulated import Truth
+
+RETREAT = 0.35
 
 BALANCED = np.array([-0.089, 0.954, 0.153, 1.345, -0.114, 0.87, -0.405, 0.859, 1.206, 1.206, 0.915])
 LOOK = 0.125  # [s] that a look takes here

@@ -14,8 +14,6 @@ from hqp_grasp.errors import InputError, ReachError, SingularTaskError, SolverEr
 from hqp_grasp.experiments import start
 from hqp_grasp.experiments.record import (
     COLUMNS,
-    CONVERGED_FORCE,
-    CONVERGED_MOMENT,
     Record,
     empty_row,
     felt_row,
@@ -32,6 +30,9 @@ from hqp_grasp.mechanics import friction_demand
 from hqp_grasp.tasks import ContactTask, ForceTask, KinematicTask, MomentTask, Stack
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Scene
+
+CONVERGED_FORCE = 0.001
+CONVERGED_MOMENT = 0.002
 
 PROBES = 4
 

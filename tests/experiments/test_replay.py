@@ -16,7 +16,6 @@ import hqp_grasp as hg
 from hqp_grasp.errors import MissingExtraError
 from hqp_grasp.experiments import scenario
 from hqp_grasp.experiments.replay import (
-    ARROW,
     FORCE_COLOUR,
     GREY,
     NORMAL_COLOUR,
@@ -36,6 +35,8 @@ from hqp_grasp.grasp import Touch
 pytest.importorskip("viser", reason="no viser: pip install 'hqp_grasp[view]'")
 import browser
 from recording import messages, scene_at
+
+ARROW = 0.04
 
 PROBES = 60
 SCENE = hg.Scene()

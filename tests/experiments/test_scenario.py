@@ -16,7 +16,7 @@ import pytest
 from hqp_grasp.control.controller import Controller
 from hqp_grasp.errors import ReachError, SolverError
 from hqp_grasp.experiments import start
-from hqp_grasp.experiments.plots import FLOOR, convergence, convergence_figure
+from hqp_grasp.experiments.plots import convergence, convergence_figure
 from hqp_grasp.experiments.scenario import (
     Settings,
     _physical,
@@ -28,6 +28,8 @@ from hqp_grasp.experiments.scenario import (
 from hqp_grasp.experiments.study import Study
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.world.scene import Prism, Scene
+
+FLOOR = 1e-16
 
 CYLINDER = Path(__file__).parents[2] / "scenarios" / "cylinder.py"
 ROBOT = Path(__file__).parents[2] / "robots" / "wam_bhand"

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from hqp_grasp.control.controller import CLIP_TOLERANCE, Step
+from hqp_grasp.control.controller import Step
 from hqp_grasp.control.episode import MissPolicy
-from hqp_grasp.control.forms import TOUCH_RANK, PaperForm, clip_to_limits
+from hqp_grasp.control.forms import PaperForm, clip_to_limits
 from hqp_grasp.control.limits import ConfigurationLimit, StepLimit
 from hqp_grasp.errors import InputError, ReachError
 from hqp_grasp.experiments.record import COLUMNS
@@ -24,6 +24,9 @@ from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.touch.physical import PhysicalProbe
 from hqp_grasp.touch.simulated import SimulatedHand, Truth
 from hqp_grasp.world.scene import Prism, Scene
+
+CLIP_TOLERANCE = 1e-09
+TOUCH_RANK = 1e-06
 
 SEEDS = (0, 1, 2)
 PROBES = 10

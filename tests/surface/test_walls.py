@@ -9,10 +9,13 @@ import pytest
 from hqp_grasp.errors import InputError
 from hqp_grasp.grasp import Contact, Grasp, Miss, Missed, Touch
 from hqp_grasp.surface.believed import believed
-from hqp_grasp.surface.felt import SLACK, UNDECIDED, Felt
+from hqp_grasp.surface.felt import Felt
 from hqp_grasp.surface.outline import SAME_ANGLE, Outline, _zero_sum, directions, wrapped
 from hqp_grasp.surface.rounded import Rounded
 from hqp_grasp.surface.walls import Walls
+
+SLACK = 2e-06
+UNDECIDED = 1e-05
 
 UP = np.array([0.0, 0.0, 1.0])
 TIP = 0.008  # [m]

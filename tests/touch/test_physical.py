@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 import hqp_grasp as hg
-from hqp_grasp.experiments.record import CONVERGED_FORCE, CONVERGED_MOMENT, balanced
+from hqp_grasp.experiments.record import balanced
 from hqp_grasp.touch import physical
 from hqp_grasp.touch.physical import payload, weight
 from hqp_grasp.world.imperfections import FAULTS, PRESETS, Fault, SensorErrors
+
+CONVERGED_FORCE = 0.001
+CONVERGED_MOMENT = 0.002
 
 POSTURE = np.array([0.62, 1.12, -0.73, 1.96, 0.63, -0.41, 0.49, 0.21, 1.01, 0.99, 0.98])
 AWAY = np.array([0.62, 0.5, -0.73, 1.96, 0.63, -0.41, 0.49, 0.21, 1.01, 0.99, 0.98])

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 import hqp_grasp as hg
-from hqp_grasp.touch.driver import PRESS_RATE, TOUCHING, require_press
+from hqp_grasp.touch.driver import TOUCHING, require_press
 from hqp_grasp.world.imperfections import Fault
+
+PRESS_RATE = 2.0
 
 # Where the geometric probe felt balance, at the end of a trial of fmk.
 BALANCED = np.array([-0.089, 0.954, 0.153, 1.345, -0.114, 0.87, -0.405, 0.859, 1.206, 1.206, 0.915])

@@ -16,8 +16,10 @@ from hqp_grasp.errors import InputError
 from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.tasks import KinematicTask, stack_of
-from hqp_grasp.touch.geometric import RETREAT, GeometricProbe
+from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
+
+RETREAT = 0.35
 
 SURFACE_TOL = 1e-7  # [m]
 NORMAL_TOL = 1e-6

@@ -16,11 +16,14 @@ from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.grasp import Grasp
 from hqp_grasp.touch.geometric import GeometricProbe
 from hqp_grasp.world.clearance import SelfClearance
-from hqp_grasp.world.description import CCD_TOLERANCE, RobotDescription, locate
+from hqp_grasp.world.description import RobotDescription, locate
 from hqp_grasp.world.objects import Cylinder
-from hqp_grasp.world.robot import SLIDE_UNIT, Robot, compiled, described
+from hqp_grasp.world.robot import Robot, compiled, described
 from hqp_grasp.world.scene import Scene
 from hqp_grasp.world.second_opinion import second_opinion
+
+CCD_TOLERANCE = 1e-12
+SLIDE_UNIT = 0.06
 
 EXACT = 1e-12
 SHORT = 'model = "tiny.xml"\n[[contact_points]]\nlink = "distal"\n'

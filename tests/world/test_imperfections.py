@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import hqp_grasp as hg
-from hqp_grasp.world.imperfections import PRESETS, SPIKE, Fault, Imperfections, SensorErrors
+from hqp_grasp.world.imperfections import PRESETS, Fault, Imperfections, SensorErrors
+
+SPIKE = 50.0
 
 K, N = 400, 500  # tips and joints, so that one run shows a spread
 RATE = 0.01  # [s]
