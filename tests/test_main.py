@@ -151,6 +151,18 @@ def test_no_command_is_spelled_in_another_way():
     assert [p.name for p in texts if old.search(p.read_text(encoding="utf-8"))] == []
 
 
+@pytest.mark.parametrize("command", ["run", "pick"])
+@pytest.mark.parametrize(("more", "code"), [((), 2), (("--help",), 0), (("--trials", "1"), 2)])
+def test_a_command_without_a_scenario_says_how_it_is_called(
+    monkeypatch, capsys, command, more, code
+):
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch, command, *more)
+    assert ended.value.code == code
+    said = "".join(capsys.readouterr())
+    assert f"hqp-grasp {command}" in said
+
+
 def defaults(command):
     parameters = inspect.signature(command).parameters.values()
     return {p.name: p.default for p in parameters if p.default is not p.empty}

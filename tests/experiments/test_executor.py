@@ -68,6 +68,20 @@ def test_where_no_process_does_anything_the_study_ends():
 
 
 @pytest.mark.usefixtures("forked")
+def test_processes_that_break_before_they_are_given_anything_are_started_again(monkeypatch):
+    tries = []
+
+    def in_pool(payload, waiting, jobs, suspects, turn):
+        tries.append(list(waiting))
+        while len(tries) > 1 and waiting:
+            i = waiting.popleft()
+            yield i, i
+
+    monkeypatch.setattr(executor, "_in_pool", in_pool)
+    assert list(run_all(Square(), range(3), jobs=2)) == [(0, 0), (1, 1), (2, 2)]
+    assert tries == [[0, 1, 2], [0, 1, 2]]
+
+
 def test_what_the_work_raises_is_raised():
     with pytest.raises(RuntimeError, match="not here"):
         list(run_all(raises, range(4), jobs=2))
