@@ -1,6 +1,7 @@
 """Two configurations are told apart by all that decides, and by nothing else."""
 
 import copy
+import copyreg
 import dataclasses
 import functools
 import importlib
@@ -313,3 +314,18 @@ def test_arrays_count_by_their_type_shape_and_numbers_and_what_holds_itself_ends
     assert Fingerprint(endless).parts["trial"] == [1, "itself"]
     twice = [0]
     assert Fingerprint([twice, twice]).parts["trial"] == [[0], [0]]  # beside is not within
+
+
+class Listed:
+    """Made anew from its attributes and from a list of items."""
+
+    def __init__(self, *items):
+        self.size, self._items = len(items), items
+
+    def __reduce_ex__(self, protocol):
+        return copyreg.__newobj__, (Listed,), {"size": self.size}, iter(self._items), None
+
+
+def test_what_is_made_of_items_beside_its_attributes_counts_by_both():
+    found = [Fingerprint(Listed(*items)).parts["trial"] for items in ((1, 2), (1, 2), (1, 3))]
+    assert found[0] == found[1] != found[2]

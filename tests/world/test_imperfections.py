@@ -170,3 +170,30 @@ def test_an_imperfection_that_cannot_be_is_refused_by_name(wrong, words):
 
 def test_a_compensation_may_err_to_either_side():
     assert Imperfections(gravity_error=-0.02).gravity_error == -0.02
+
+
+@pytest.mark.parametrize("kind", ["spike", "freeze", "dropout"])
+def test_before_and_after_its_time_a_fault_is_nothing_and_in_it_its_finger_alone_is_broken(kind):
+    fault = Fault(kind, 1, begin=1.0, duration=0.5)
+    sensors = SensorErrors(
+        Imperfections(faults=(fault,)), 3, np.zeros(11, bool), np.random.default_rng(0)
+    )
+
+    def said(begin):
+        time = begin + 0.01 * np.arange(10)
+        true = time[:, None, None] * np.ones((10, 3, 6))
+        return true, sensors.wrench(time, true)
+
+    for begin in (0.0, 0.9, 1.5, 9.0):  # up to 0.99, and from 1.5 on
+        true, felt = said(begin)
+        np.testing.assert_array_equal(felt, true)
+    for begin in (1.0, 1.2, 1.4):
+        true, felt = said(begin)
+        np.testing.assert_array_equal(felt[:, [0, 2]], true[:, [0, 2]])
+        if kind == "dropout":
+            assert not felt[:, 1].any()
+        elif kind == "freeze":
+            np.testing.assert_array_equal(felt[:, 1], 1.0)  # what it said as it broke
+        else:
+            off = felt - true
+            assert off[0, 1, 2] == 50.0 and np.count_nonzero(off) == 1  # [N] one sample of it
