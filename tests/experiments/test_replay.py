@@ -300,6 +300,13 @@ def test_every_body_is_where_the_joint_angles_put_it(record, played):
             assert np.allclose(node["wxyz"], data.xquat[body], rtol=2e-5)
 
 
+def test_frames_of_bodies_are_places_and_not_drawn(played):
+    nodes = scene_at(played[1], 0.5)
+    frames = [name for name, node in nodes.items() if "show_axes" in node]
+    assert len(frames) >= SCENE.model.nbody
+    assert [name for name in frames if nodes[name]["show_axes"]] == []
+
+
 def test_the_errors_of_the_probe_stand_beside_it(record, played):
     text = scene_at(played[1], 3.5)["/errors/numbers"]["text"]
     assert "cylinder, trial 0" in text and f"probe 3 of {PROBES}: touch" in text
