@@ -680,6 +680,31 @@ def test_what_a_move_only_hides_is_found(toy):
         END(rig)
 
 
+def test_a_finger_that_closed_on_nothing_is_waited_for_until_it_stands_and_no_longer(scene, grasp):
+    """By 0.9 rad/s to the end of its range, as the hand's own clock tells; not for 8 s."""
+    lasted = []
+
+    class Timed(Broken):
+        began = None
+
+        def close(self, finger, speed, force):
+            super().close(finger, speed, force)
+            self.began = self.hand._state[0]
+
+        def stop(self):
+            super().stop()
+            if self.began is not None:
+                lasted.append(self.hand._state[0] - self.began)
+                self.began = None
+
+    rig = rig_of(Timed(hg.SimulatedHand(scene, COARSE)), scene, grasp)
+    contract.ranges_are_kept(rig)
+    flexion = [j for (j,) in scene.articulated.flexion]
+    ways = (scene.articulated.q_upper - rig.free[0])[flexion]
+    assert len(lasted) == 3 and (np.array(lasted) < ways / 0.9 + 0.6).all()
+    assert max(lasted) > 1.0
+
+
 def test_normals_that_are_known_to_ten_degrees_are_enough(scene, grasp):
     physics = hg.Physics(imperfections=hg.Imperfections.preset("loadcell"))
     good = rig_of(hg.SimulatedHand(scene, physics), scene, grasp)
