@@ -213,7 +213,7 @@ def constants(source):
 def test_the_planners_room_has_no_more_constants_than_it_had():
     """A constant is a debt: a new one takes the place of another, or moves this bound knowingly."""
     found = [f"{p.name}: {name}" for p in ROOM for name in constants(p.read_text("utf-8"))]
-    assert len(found) <= 52, found
+    assert len(found) <= 50, found
     assert list(constants("A = 1\nB: int = 2\nc = 3\nD, E = 4, 5\ndef f():\n    G = 6\n")) == [
         *"ABDE"
     ]

@@ -13,9 +13,7 @@ from hqp_grasp.surface.surface import distinct, unit
 
 FLATTEST = 1e-3  # [–] of normals, below which lifting contacts leaves their moment as it is
 SHARPER = 0.6  # [–] radius that each further touch of a face leaves of its corners
-FLATTER = 0.5  # [m] radius of what counts as flat
 FLAT = 1e-3  # [m] a face is known to be flat where it was felt so far apart
-CORNER = 2.4  # [rad] neighbouring faces turn by less where they meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +110,8 @@ def _corners(x: np.ndarray, n: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray
     """
     order = np.argsort(felt)
     turn = np.diff(felt[order], append=felt[order[0]] + 2.0 * np.pi)
-    last = np.flatnonzero(turn > np.sqrt(2.0 * SAME_NORMAL))  # of each group of equal normals
+    same = np.sqrt(2.0 * SAME_NORMAL)  # [rad]
+    last = np.flatnonzero(turn > same)  # of each group of equal normals
     G = len(last)
     if G < 2:
         return np.zeros((0, 2)), np.zeros(0)
@@ -124,13 +123,9 @@ def _corners(x: np.ndarray, n: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray
     low, high = np.full(G, np.inf), np.full(G, -np.inf)
     np.minimum.at(low, group, along)
     np.maximum.at(high, group, along)
-    first = np.append(last[-1] + 1 - len(felt), last[:-1] + 1)  # of each group
-    spread = (felt[order[last]] - felt[order[first % len(felt)]]) % (2.0 * np.pi)
-    flat = high - low
-    flat[spread * FLATTER > flat] = 0.0
-    flat = np.where(flat > FLAT, np.bincount(group, minlength=G) - 1.0, 0.0)
+    flat = np.where(high - low > FLAT, np.bincount(group, minlength=G) - 1.0, 0.0)
     a, b = np.arange(G), (np.arange(G) + 1) % G
-    a = a[(turn[last] < CORNER) & (flat[a] + flat[b] > 0.0)]
+    a = a[(turn[last] < np.pi - same) & (flat[a] + flat[b] > 0.0)]
     b, half = (a + 1) % G, 0.5 * turn[last[a]]
     planes = np.stack([normal[a], normal[b]], axis=1)
     solved = np.linalg.solve(
