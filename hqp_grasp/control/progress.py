@@ -85,12 +85,6 @@ class Progress:
         return cls(stack, touches, scores, nearest, best, worse, over)
 
     @property
-    def unbalanced(self) -> list[Grasp]:
-        """The grasps felt that do not balance."""
-        touches = zip(self.touches, self.scores, strict=True)
-        return [t.felt for t, score in touches if isinstance(t.felt, Grasp) and score > 1.0]
-
-    @property
     def damping(self) -> float:
         """Share of the lower laws' step to take: half of it for each balanced grasp it made worse.
 
@@ -102,7 +96,7 @@ class Progress:
         hits = [t.felt for t in self.touches if isinstance(t.felt, Grasp)]
         radii = np.array([[contact.tip_radius for contact in grasp.contacts] for grasp in hits])
         if np.ptp(radii, axis=0).max() > SLACK:
-            halvings += len(self.unbalanced) - 1
+            halvings += int((np.isfinite(self.scores) & (self.scores > 1.0)).sum()) - 1
         return 0.5 ** max(halvings, 0)
 
     def way_back(self, left: int | None, grasp: Grasp) -> np.ndarray | None:
