@@ -3,8 +3,8 @@
     python benchmarks/outside_robots.py --trials 20 --seed 277
     python benchmarks/outside_robots.py --only shadow --trials 20
 
-Their files come from pip packages, which `make outside` installs; the descriptions are in
-benchmarks/robots/. "Good" is the verdict of `hqp-grasp report`; beside it stand the
+Their files come from pip packages, which `make outside` installs; the descriptions are in robots/.
+"Good" is the verdict of `hqp-grasp report`; beside it stand the
 deepest overlap of the robot's own links and the largest violation at any probe of a good trial.
 """
 
@@ -16,7 +16,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 import tyro
@@ -25,7 +24,6 @@ import hqp_grasp as hg
 from hqp_grasp.errors import HqpGraspError
 from hqp_grasp.world.clearance import SelfClearance
 
-HERE = Path(__file__).parent / "robots"
 HEXAGON = hg.Prism.regular(6, 0.06)
 
 
@@ -33,7 +31,7 @@ HEXAGON = hg.Prism.regular(6, 0.06)
 class Case:
     """A robot, one of its hands, and what it grasps."""
 
-    robot: str | Path
+    robot: str
     thing: hg.Cylinder | hg.Prism
     hand: str | None = None
 
@@ -43,13 +41,13 @@ class Case:
 
 
 CASES = {
-    "allegro, 45 mm": Case(HERE / "panda_allegro.toml", hg.Cylinder(0.045)),
-    "shadow, 30 mm": Case(HERE / "shadow.toml", hg.Cylinder(0.03)),
-    "robotiq, 20 mm": Case(HERE / "iiwa_robotiq.toml", hg.Cylinder(0.02)),
-    "robotiq, 30 mm": Case(HERE / "iiwa_robotiq.toml", hg.Cylinder(0.03)),
-    "inspire, 30 mm": Case(HERE / "inspire.toml", hg.Cylinder(0.03)),
-    "fourier, 30 mm": Case(HERE / "fourier.toml", hg.Cylinder(0.03)),
-    "baxter, 120 mm": Case(HERE / "baxter.toml", hg.Cylinder(0.12)),
+    "allegro, 45 mm": Case("allegro", hg.Cylinder(0.045)),
+    "shadow, 30 mm": Case("shadow", hg.Cylinder(0.03)),
+    "robotiq, 20 mm": Case("robotiq", hg.Cylinder(0.02)),
+    "robotiq, 30 mm": Case("robotiq", hg.Cylinder(0.03)),
+    "inspire, 30 mm": Case("inspire", hg.Cylinder(0.03)),
+    "fourier, 30 mm": Case("fourier", hg.Cylinder(0.03)),
+    "baxter, 120 mm": Case("baxter", hg.Cylinder(0.12)),
     "torso right, 50 mm": Case("umass_torso", hg.Cylinder(0.05), "right"),
     "torso left, 50 mm": Case("umass_torso", hg.Cylinder(0.05), "left"),
     "torso right, hexagon": Case("umass_torso", HEXAGON, "right"),

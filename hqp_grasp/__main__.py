@@ -21,6 +21,8 @@ from hqp_grasp.experiments.plain import speak_plainly
 from hqp_grasp.experiments.robot_check import check
 from hqp_grasp.experiments.view import HOST, PORT, serve
 from hqp_grasp.judge.judge import Judge
+from hqp_grasp.world.description import MODELS
+from hqp_grasp.world.draft import write_draft
 from hqp_grasp.world.scene import Scene
 
 app = SubcommandApp()
@@ -133,11 +135,17 @@ def robot(
 ) -> None:
     """Say how a robot was understood: joints, couplings, closing, palm, self-collisions.
 
+    Of a model alone, .xml or .urdf, a first description is written beside it, to be corrected.
+
     Args:
-        path: A robot of this package by name, or a folder with a robot.toml, or such a file.
+        path: A robot of this package by name, or a folder with a robot.toml, or such a file; or
+            a model.
         hand: The hand that grasps, of a robot with several.
         picture: File to draw it into.
     """
+    if Path(path).suffix.lower() in MODELS:
+        path = str(write_draft(Path(path)))
+        print(f"wrote    {path}, a first description: read it, and correct what is wrong\n")
     print(check(path, hand, picture))
 
 

@@ -23,6 +23,7 @@ from hqp_grasp.world.compiling import compiled_spec, read_afresh
 INF = math.inf
 SPEED, SLIDE_SPEED = 1.0, 0.25  # [rad/s], [m/s] of joints for which a description gives none
 CLEARANCE = 0.005  # [m] that links keep between them
+MODELS = (".xml", ".mjcf", ".urdf")  # files with a robot in them
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo loads
 # Nearest points of meshes and boxes: with MuJoCo's defaults their direction is off by 4e-3 at a gap
 # of 1e-6 m, with these by 2e-6 down to 1e-9 m. For balls, whose centre gives the direction, the
@@ -325,7 +326,7 @@ class RobotDescription:
         """Read a robot of this package by name; any folder with a robot.toml, or file, by path."""
         path = _find(robot)
         try:
-            data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+            text = path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise ModelError(
                 f"{path} is not UTF-8, as TOML must be: byte {error.start} is "
@@ -333,6 +334,13 @@ class RobotDescription:
             ) from error
         except OSError as error:
             raise ModelError(f"{path} cannot be read: {error.strerror}") from error
+        return cls.read(text, path, hand)
+
+    @classmethod
+    def read(cls, text: str, path: Path, hand: str | None = None) -> RobotDescription:
+        """What `text` says, as if it stood in the file `path`."""
+        try:
+            data = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise ModelError(f"{path} is not valid TOML: {error}") from error
         try:
@@ -642,6 +650,11 @@ def ball_name(point: ContactPoint) -> str:
 
 def _find(robot: str | Path) -> Path:
     """The robot.toml of a robot by name, folder or file."""
+    if Path(robot).suffix.lower() in MODELS:
+        raise ModelError(
+            f"{robot} is a model, and a robot is a description of one: hqp-grasp robot {robot} "
+            "writes a first one beside it"
+        )
     if isinstance(robot, Path) or "/" in str(robot) or str(robot).endswith(".toml"):
         path = Path(robot)
         if path.suffix == ".toml":
@@ -662,27 +675,53 @@ def locate(text: str, folder: Path) -> Path:
     The path begins in the package's own folder, or is how the path of one of the installed files
     ends.
     """
-    package, colon, inside = text.partition(":")
-    if not colon or "/" in package:
+    package, _, inside = text.partition(":")
+    if not _package(text):
         return folder / text
-    spec = find_spec(package) if package.isidentifier() else None
-    for place in (spec.submodule_search_locations or ()) if spec is not None else ():
-        if (Path(place) / inside).exists():
-            return Path(place) / inside
+    _refuse_missing([text])
+    for place in _places(package):
+        if (place / inside).exists():
+            return place / inside
     try:
         installed = metadata.files(package) or []
     except metadata.PackageNotFoundError:
         installed = []
-        if spec is None:
-            raise ModelError(
-                f"{text}: the package {package!r} is not installed; pip install --no-deps "
-                f"{package} is enough"
-            ) from None
     found = sorted({str(f.locate()) for f in installed if f"/{f}".endswith(f"/{inside}")})
     if len(found) != 1:
         what = f"{len(found)} files end so: {', '.join(found[:3])}" if found else "no such file"
         raise ModelError(f"{text}: {what} in the installed package {package!r}")
     return Path(found[0])
+
+
+def _package(text: str) -> str:
+    """The package of a `package:path`; "" for a path."""
+    package, colon, _ = text.partition(":")
+    return package if colon and "/" not in package else ""
+
+
+def _places(package: str) -> list[Path]:
+    """The folders of an importable package, none where there is none."""
+    spec = find_spec(package) if package.isidentifier() else None
+    return [Path(place) for place in (spec.submodule_search_locations or ())] if spec else []
+
+
+def _refuse_missing(files: Sequence[str]) -> None:
+    """Raise, with the line that installs them, for all packages of these that are not there."""
+    missing: dict[str, str] = {}
+    for text in files:
+        package = _package(text)
+        if package and not _places(package):
+            try:
+                metadata.distribution(package)
+            except metadata.PackageNotFoundError:
+                missing.setdefault(package, text)
+    if missing:
+        names = ", ".join(map(repr, missing))
+        what = "packages {} are" if len(missing) > 1 else "package {} is"
+        raise ModelError(
+            f"{next(iter(missing.values()))}: the {what.format(names)} not installed; "
+            f"pip install --no-deps {' '.join(missing)} is enough"
+        )
 
 
 def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
@@ -710,6 +749,8 @@ def _description(path: Path, data: Mapping[str, Any]) -> RobotDescription:
         raise InputError("groups is empty")
     _refuse_twice("groups", [group.name for group in groups])
     hands = _hands(groups, _table("hands", data, "hands"))
+    told = (part.get("file") if isinstance(part, dict) else part for part in parts)
+    _refuse_missing([text for text in told if isinstance(text, str)])
     files = tuple(_file(part, folder) for part in parts)
     named, bases = data.get("home"), dict[str, tuple[float, ...]]()
     if named is None or isinstance(named, str):

@@ -698,7 +698,11 @@ def _refuse_no_numbers(model: mujoco.MjModel, about: RobotDescription) -> None:
 
 def described(robot: str | Path, hand: str | None = None) -> RobotDescription:
     """A robot's description; where a carriage has no palm to hold it by, with the one found."""
-    about = RobotDescription.load(robot, hand)
+    return with_palm(RobotDescription.load(robot, hand))
+
+
+def with_palm(about: RobotDescription) -> RobotDescription:
+    """The same; where a carriage has no palm to hold it by, with the one found."""
     if about.carriage and about.grasping[0].palm is None:
         alone = replace(about, carriage=False)
         found = Robot(alone, compiled(alone))
