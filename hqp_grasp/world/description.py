@@ -650,7 +650,7 @@ def ball_name(point: ContactPoint) -> str:
 
 def _find(robot: str | Path) -> Path:
     """The robot.toml of a robot by name, folder or file."""
-    if Path(robot).suffix.lower() in MODELS:
+    if isinstance(robot, str | Path) and Path(robot).suffix.lower() in MODELS:
         raise ModelError(
             f"{robot} is a model, and a robot is a description of one: hqp-grasp robot {robot} "
             "writes a first one beside it"
