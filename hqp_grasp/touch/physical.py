@@ -19,6 +19,7 @@ from hqp_grasp.world.robot import Robot
 GRAVITY = np.array([0.0, 0.0, -9.81])  # [m/s²] world
 OPENING = 0.3  # [s] at least, each ramp
 MOVING = 0.4
+BACKING = 0.01  # [m] a palm goes back by, to free fingers that do not open
 RESTING = 0.1  # [s] before the tips are weighed
 LISTENING = 0.05  # [s] to the sensors, before each move
 DEAF = 2.0  # [s] that a silent sensor is waited for
@@ -186,6 +187,8 @@ class PhysicalProbe:
         """Open to way[0], go along the others, and close."""
         for i, q in enumerate(way):
             fault = self._go(q, MOVING if i else OPENING)
+            if fault and not i:
+                fault = self._backed_off(q, fault)
             if fault:
                 heard = self._listen()
                 reason = Miss.BLOCKED if i else Miss.STUCK
@@ -201,6 +204,19 @@ class PhysicalProbe:
             return missed
         self.driver.hold(self.force)
         return self._sense(free, self._settle(free))
+
+    def _backed_off(self, opened: np.ndarray, fault: str) -> str:
+        """Open once more, the palms first drawn back; return what stopped the hand, as `_go` does.
+
+        A finger that closes nearly along a surface is wedged on it: as it opens, friction pulls it
+        into the surface. Drawn off along its palm's axis it is free.
+        """
+        robot = self.robot
+        if not robot.arm:
+            return fault
+        back = robot.withdrawn(self._wait(0.0).q[-1], BACKING)
+        there = np.where(robot.closing.any(axis=0), opened, back)
+        return self._go(back, MOVING) or self._go(there, OPENING)
 
     def _settle(self, free: Readings) -> Readings:
         """Readings under the held force, once it is what was asked for.

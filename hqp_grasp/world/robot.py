@@ -533,12 +533,24 @@ class Robot:
         for g, group in enumerate(self.groups):
             for i in group.points:
                 if self.description.contact_points[i].by_arm:
-                    arm = list(group.arm)
-                    straight = np.append(self.palm(q, g)[1][:, 2], np.zeros(3))
-                    way = np.linalg.pinv(self.palm_jacobian(q, g)[:, arm], rcond=SINGULAR)
                     closing = closing.copy()
-                    closing[i, arm] = way @ straight
+                    closing[i] = self._straight(q, g)
         return closing
+
+    def withdrawn(self, q: np.ndarray, far: float) -> np.ndarray:
+        """q (n,) with every palm back by `far` [m] along its approach axis, for short ways.
+
+        Fingers keep their joints, and all joints their ranges. A palm without an arm stays.
+        """
+        back = np.sum([self._straight(q, g) for g in range(len(self.groups))], axis=0)
+        return np.clip(q - far * back, self.q_lower, self.q_upper)
+
+    def _straight(self, q: np.ndarray, g: int) -> np.ndarray:
+        """How q (n,) moves as an arm brings its palm on by 1 m along its axis, without a turn."""
+        arm, way = list(self.groups[g].arm), np.zeros(self.n)
+        straight = np.append(self.palm(q, g)[1][:, 2], np.zeros(3))
+        way[arm] = np.linalg.pinv(self.palm_jacobian(q, g)[:, arm], rcond=SINGULAR) @ straight
+        return way
 
     def group_of(self, where: str) -> int:
         """The group of a contact point, or of a link or geom that one of the arms carries.
