@@ -11,6 +11,7 @@ import numpy as np
 from hqp_grasp.control.reach import reach
 from hqp_grasp.errors import InputError, ReachError, positive, whole
 from hqp_grasp.grasp import Grasp, Miss, as_array
+from hqp_grasp.tasks import KinematicTask
 from hqp_grasp.touch.probe import Probe
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
@@ -62,7 +63,9 @@ class Start:
     defaults are the paper's (section 4). What it leaves open: the palm faces the object's middle
     from the robot's side (a draw beyond the object is mirrored), its opposition axis horizontal.
     It begins where the fingers barely reach, a whole number of `advance` nearer than drawn, or
-    farther, and advances along the approach axis until all fingers touch.
+    farther, and advances along the approach axis until all fingers touch. Fingers that barely reach
+    a wide object close along its surface rather than into it: where some `lean` more than they
+    should, their palm comes nearer still, as long as that is a touch.
 
     Where a fingertip then meets an edge or an end face, the palm withdraws, moves along the
     vertical and turns about the approach axis, both so that this finger comes nearer the middle,
@@ -76,6 +79,8 @@ class Start:
     offset: tuple[float, float] = (-0.18, 0.18)  # [m] of the palm from the object, in x and in y
     facing: tuple[float, float] = (-np.radians(20.0), np.radians(20.0))
     # [rad] of several palms, seen from above, each from facing the others
+    lean: float = np.radians(90.0)
+    # [rad] between a finger's way as it closes and the normal, above which its palm comes nearer
     advance: float = 0.01  # [m] the palm comes nearer by, while the fingers do not reach
     max_draws: int = 500  # before the object counts as out of reach
 
@@ -85,7 +90,9 @@ class Start:
             if low > high:
                 raise InputError(f"Start.{name} must be a range (low, high); got {(low, high)}")
             object.__setattr__(self, name, (low, high))
-        object.__setattr__(self, "advance", positive("Start.advance [m]", self.advance))
+        for name, unit in (("advance", "m"), ("lean", "rad")):
+            value = positive(f"Start.{name} [{unit}]", getattr(self, name))
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "max_draws", whole("Start.max_draws", self.max_draws, 1))
 
     def draw(
@@ -173,13 +180,37 @@ class Start:
             vertical = felt.normals[:, 2]
             worst = int(np.abs(vertical).argmax())
             if abs(vertical[worst]) <= scene.object.steepest:
-                return placed, felt
+                return self._nearer(scene, probe_in, fixed, places, (placed, felt))
             no = _Rejected(EDGE, f"{felt.contacts[worst].name} {EDGE}")
             g = robot.group_of(felt.contacts[worst].name)
             back = places[g].distance + BACK * self.advance
             nearer = _nearer_the_middle(placed, felt, worst, g, places[g])
             places[g] = replace(nearer, distance=back)
         return no
+
+    def _nearer(
+        self,
+        scene: Scene,
+        probe_in: Callable[[Scene], Probe],
+        fixed: list[int],
+        places: Sequence[_Place],
+        found: tuple[Scene, Grasp],
+    ) -> tuple[Scene, Grasp]:
+        """The touch `found`, or one with palms nearer, so that fingers lean less."""
+        robot, law, places = scene.articulated, KinematicTask(), list(places)
+        for g, group in enumerate(robot.groups):
+            while law.error(found[1])[list(group.points)].max() > self.lean:
+                there = replace(places[g], distance=places[g].distance - self.advance)
+                reached = _placed(scene, found[1].q, fixed, [*places[:g], there, *places[g + 1 :]])
+                if reached is None:
+                    break
+                felt = probe_in(reached[0]).touch(reached[1])
+                if not isinstance(felt, Grasp) or felt.other_links:
+                    break
+                if np.abs(felt.normals[:, 2]).max() > scene.object.steepest:
+                    break
+                places[g], found = there, (reached[0], felt)
+        return found
 
 
 @dataclass(frozen=True)

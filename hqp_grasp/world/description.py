@@ -39,6 +39,7 @@ START = (
     "elevation",
     "offset",
     "facing",
+    "lean",
     "advance",
     "joints",
 )  # of the drawn first postures
@@ -950,6 +951,8 @@ def _start(data: object) -> Mapping[str, Any]:
     for key, value in data.items():
         if key in ("advance", "joints"):
             start[key] = _number(f"start.{key}", value)
+        elif key == "lean":
+            start[key] = np.radians(_number("start.lean", value))
         else:
             low, high = _range(f"start.{key}", value)
             turn = 1.0 if key == "offset" else np.pi / 180.0
