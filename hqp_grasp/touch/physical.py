@@ -88,18 +88,26 @@ class PhysicalProbe:
         """Move to q_target (n,) [rad], close every finger, and return the grasp felt there.
 
         The postures `via` (n,) [rad], such as a `Step` has, are passed first with open fingers. A
+        palm whose fingers cannot open as far as others draws back by what they lack, until it is
+        there. A
         touch that misses ends where it began, or at the last of those that were passed, its
         fingers open: the next one approaches from where the last grasp was felt.
         """
         target = self.robot.require_q("q_target", q_target)
-        *passed, away = (self._away(self.robot.require_q("via", q)) for q in (*via, target))
+        via = [self.robot.require_q("via", q) for q in via]
+        *passed, away = (self._away(q) for q in (*via, target))
         object.__setattr__(self, "_clock", -np.inf)
         try:
             heard = self._listen()
             if isinstance(heard, Missed):
                 return heard
             way = [self._opened(heard, (passed or [away])[0]), *passed, away]
-            felt = self._touch(way, target)
+            short = np.max([self._short(q) for q in (heard.q[-1], *via, target)], axis=0)
+            drew_back = bool(short.any() and self.robot.arm)
+            if drew_back:
+                free = [self.robot.withdrawn(q, short) for q in way]
+                way = [way[0], *free, away]
+            felt = self._touch(way, target, drew_back)
             if isinstance(felt, Missed):
                 self._retreat(felt, way)
         except _SilentError as what:
@@ -183,16 +191,34 @@ class PhysicalProbe:
         opened = np.where(closing > 0.0, np.minimum(opened, away), np.maximum(opened, away))
         return np.where(closing != 0.0, np.clip(opened, limits.lower, limits.upper), q)
 
-    def _touch(self, way: Sequence[np.ndarray], target: np.ndarray) -> Grasp | Missed:
-        """Open to way[0], go along the others, and close."""
+    def _short(self, q: np.ndarray) -> np.ndarray:
+        """What fingers at q (n,) lack, of each group (groups,) [m], to open by RETREAT."""
+        robot = self.robot
+        beyond = robot.centers(q - RETREAT * robot.closing.sum(axis=0))
+        lacks = np.linalg.norm(beyond - robot.centers(self._away(q)), axis=1)
+        return np.array([lacks[list(group.points)].max() for group in robot.groups])
+
+    def _touch(
+        self, way: Sequence[np.ndarray], target: np.ndarray, drew_back: bool
+    ) -> Grasp | Missed:
+        """Open to way[0], go along the others, and close.
+
+        Where palms drew back, what stops the hand on the last leg is an open finger that meets the
+        object.
+        """
         for i, q in enumerate(way):
+            before = self._wait(0.0) if drew_back and i == len(way) - 1 else None
             fault = self._go(q, MOVING if i else OPENING)
             if fault and not i:
                 fault = self._backed_off(q, fault)
             if fault:
                 heard = self._listen()
-                reason = Miss.BLOCKED if i else Miss.STUCK
-                return heard if isinstance(heard, Missed) else Missed(reason, fault)
+                if isinstance(heard, Missed):
+                    return heard
+                if before is not None:
+                    change = np.linalg.norm((heard.wrench - before.wrench[-1])[-1, :, :3], axis=1)
+                    return Missed(Miss.INSIDE, self._names[int(change.argmax())])
+                return Missed(Miss.BLOCKED if i else Miss.STUCK, fault)
         self._wait(RESTING)
         free = self._wait(WEIGHING)
         object.__setattr__(self, "_weighed", free)
@@ -214,7 +240,7 @@ class PhysicalProbe:
         robot = self.robot
         if not robot.arm:
             return fault
-        back = robot.withdrawn(self._wait(0.0).q[-1], BACKING)
+        back = robot.withdrawn(self._wait(0.0).q[-1], np.full(len(robot.groups), BACKING))
         there = np.where(robot.closing.any(axis=0), opened, back)
         return self._go(back, MOVING) or self._go(there, OPENING)
 

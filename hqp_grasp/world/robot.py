@@ -537,13 +537,13 @@ class Robot:
                     closing[i] = self._straight(q, g)
         return closing
 
-    def withdrawn(self, q: np.ndarray, far: float) -> np.ndarray:
-        """q (n,) with every palm back by `far` [m] along its approach axis, for short ways.
+    def withdrawn(self, q: np.ndarray, far: np.ndarray) -> np.ndarray:
+        """q (n,) with each group's palm back by `far` (groups,) [m] along its approach axis.
 
-        Fingers keep their joints, and all joints their ranges. A palm without an arm stays.
+        To first order, within the joints' ranges; fingers keep their joints.
         """
-        back = np.sum([self._straight(q, g) for g in range(len(self.groups))], axis=0)
-        return np.clip(q - far * back, self.q_lower, self.q_upper)
+        back = sum(far[g] * self._straight(q, g) for g in range(len(self.groups)))
+        return np.clip(q - back, self.q_lower, self.q_upper)
 
     def _straight(self, q: np.ndarray, g: int) -> np.ndarray:
         """How q (n,) moves as an arm brings its palm on by 1 m along its axis, without a turn."""
