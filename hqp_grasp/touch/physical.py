@@ -43,6 +43,7 @@ SPIKE = 0.5  # share of the held force by which a sample lies beside the others,
 STEEP = 1.5  # [–] tangential by normal force that no fingertip holds
 NEAR = 2e-3  # [m] from a link of the robot, or from the table, a tip touches that
 UPWARDS = 0.7  # [–] vertical part of a table's normal, at least, as it is felt
+BENT = 0.03  # [rad] from the end of its range a finger opens no further: what it bumps bends it
 CLOSED = 0.02  # [rad] from the end of its range a finger is closed
 
 
@@ -180,16 +181,16 @@ class PhysicalProbe:
     def _away(self, q: np.ndarray) -> np.ndarray:
         """The posture q (n,) [rad], each finger opened by RETREAT."""
         limits, closing = self.driver.limits, self.robot.closing.sum(axis=0)
-        opened = np.clip(q - RETREAT * closing, limits.lower, limits.upper)
+        opened = np.clip(q - RETREAT * closing, limits.lower + BENT, limits.upper - BENT)
         return np.where(closing != 0.0, opened, q)
 
     def _opened(self, readings: Readings, away: np.ndarray) -> np.ndarray:
         """Where the hand is, each finger opened by RETREAT, and at least as far as in `away`."""
         limits, closing = self.driver.limits, self.robot.closing.sum(axis=0)
         q = np.clip(readings.q[-1], limits.lower, limits.upper)
-        opened = q - RETREAT * closing
+        opened = np.clip(q - RETREAT * closing, limits.lower, limits.upper)
         opened = np.where(closing > 0.0, np.minimum(opened, away), np.maximum(opened, away))
-        return np.where(closing != 0.0, np.clip(opened, limits.lower, limits.upper), q)
+        return np.where(closing != 0.0, opened, q)
 
     def _short(self, q: np.ndarray) -> np.ndarray:
         """What fingers at q (n,) lack, of each group (groups,) [m], to open by RETREAT."""
@@ -235,10 +236,11 @@ class PhysicalProbe:
         """Open once more, the palms first drawn back; return what stopped the hand, as `_go` does.
 
         A finger that closes nearly along a surface is wedged on it: as it opens, friction pulls it
-        into the surface. Drawn off along its palm's axis it is free.
+        into the surface. Drawn off along its palm's axis it is free, where another hand has the
+        other side: fingers of one hand are about the object.
         """
         robot = self.robot
-        if not robot.arm:
+        if len(robot.groups) == 1:
             return fault
         back = robot.withdrawn(self._wait(0.0).q[-1], np.full(len(robot.groups), BACKING))
         there = np.where(robot.closing.any(axis=0), opened, back)
