@@ -401,8 +401,8 @@ def test_fingers_reach_as_far_before_the_palm_as_the_worst_of_their_tips(scene):
         ((robot.centers(robot.opened(q, share)) - p) @ R)[:, 2] + robot.tip_radius
         for share in np.linspace(0.0, 1.0, 200)
     ]
-    assert _reach(robot, q) == pytest.approx(np.max(ahead, axis=0).min(), abs=1e-3)
-    assert np.max(ahead, axis=0).min() - _reach(robot, q) >= 0.0
+    assert _reach(robot, q, 0) == pytest.approx(np.max(ahead, axis=0).min(), abs=1e-3)
+    assert np.max(ahead, axis=0).min() - _reach(robot, q, 0) >= 0.0
 
 
 def test_an_object_extends_as_far_as_its_farthest_geom():
