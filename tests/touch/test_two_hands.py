@@ -83,7 +83,7 @@ def test_palms_draw_back_on_the_way_by_what_their_fingers_cannot_open(scene):
     f1 = robot.joints.index("right_bhand_f1_proximal")
     assert first.q[f1] < 0.2  # of the 0.35 rad that it would open by
     assert len(hand.sent) == 4
-    opened, back, there, away = hand.sent
+    _opened, _back, there, away = hand.sent
     np.testing.assert_allclose(away, there, atol=0.2)
     assert away[f1] == pytest.approx(robot.q_lower[f1] + 0.03)
     p, R = robot.palm(away, 0)
