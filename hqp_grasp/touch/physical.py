@@ -104,7 +104,7 @@ class PhysicalProbe:
                 return heard
             way = [self._opened(heard, (passed or [away])[0]), *passed, away]
             short = np.max([self._short(q) for q in (heard.q[-1], *via, target)], axis=0)
-            drew_back = bool(short.any() and self.robot.arm)
+            drew_back = self._beside and bool(short.any())
             if drew_back:
                 free = [self.robot.withdrawn(q, short) for q in way]
                 way = [way[0], *free, away]
@@ -163,6 +163,14 @@ class PhysicalProbe:
         return self._clock
 
     @property
+    def _beside(self) -> bool:
+        """Whether each palm has a side of the object, off which it draws its fingers as it goes.
+
+        Fingers of a single hand are about the object: they cannot be drawn off it.
+        """
+        return len(self.robot.groups) > 1
+
+    @property
     def _names(self) -> list[str]:
         return [point.name for point in self.robot.description.contact_points]
 
@@ -181,7 +189,8 @@ class PhysicalProbe:
     def _away(self, q: np.ndarray) -> np.ndarray:
         """The posture q (n,) [rad], each finger opened by RETREAT."""
         limits, closing = self.driver.limits, self.robot.closing.sum(axis=0)
-        opened = np.clip(q - RETREAT * closing, limits.lower + BENT, limits.upper - BENT)
+        bent = BENT if self._beside else 0.0
+        opened = np.clip(q - RETREAT * closing, limits.lower + bent, limits.upper - bent)
         return np.where(closing != 0.0, opened, q)
 
     def _opened(self, readings: Readings, away: np.ndarray) -> np.ndarray:
@@ -236,12 +245,11 @@ class PhysicalProbe:
         """Open once more, the palms first drawn back; return what stopped the hand, as `_go` does.
 
         A finger that closes nearly along a surface is wedged on it: as it opens, friction pulls it
-        into the surface. Drawn off along its palm's axis it is free, where another hand has the
-        other side: fingers of one hand are about the object.
+        into the surface. Drawn off along its palm's axis it is free.
         """
-        robot = self.robot
-        if len(robot.groups) == 1:
+        if not self._beside:
             return fault
+        robot = self.robot
         back = robot.withdrawn(self._wait(0.0).q[-1], np.full(len(robot.groups), BACKING))
         there = np.where(robot.closing.any(axis=0), opened, back)
         return self._go(back, MOVING) or self._go(there, OPENING)
