@@ -761,3 +761,20 @@ def test_laws_are_by_default_the_papers_for_an_object_of_five_centimetres() -> N
     assert (angle.kind, angle.form, angle.gain, rows.gain) == ("angle", "gradient", 0.6, 0.25)
     assert (force.gain, moment.gain) == (1.0, 1.0)
     assert {law.weight for law in (force, moment, angle, rows)} == {1.0}
+
+
+@pytest.mark.parametrize("k", [2, 3, 6])
+@pytest.mark.parametrize("far", [0.05, 0.1, 0.25])
+def test_goals_grow_with_contacts_and_beyond_a_hand_with_their_distance(k: int, far: float) -> None:
+    """As what friction makes good does; wherever the object stands."""
+    t = 2.0 * np.pi * np.arange(k) / k
+    n = np.column_stack([np.cos(t), np.sin(t), np.zeros(k)])
+    goals = []
+    for at in (np.zeros(3), np.array([0.7, -0.4, 0.2])):
+        contacts = [Contact(at + far * v, v) for v in n]
+        goals.append(MomentTask().goal_at(Grasp(np.zeros(2), contacts, np.zeros((3 * k, 2)))))
+    beyond = max(1.0, far / 0.1)  # [m] within which one hand grasps
+    np.testing.assert_allclose(goals, 4e-6 * (k / 3.0 * beyond) ** 2)
+    grasp = Grasp(np.zeros(2), contacts, np.zeros((3 * k, 2)))
+    assert ForceTask().goal_at(grasp) == pytest.approx(1e-3 * (k / 3.0) ** 2)
+    assert KinematicTask().goal_at(grasp) is None
