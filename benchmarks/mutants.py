@@ -185,7 +185,7 @@ def mutants_of(source: str, module: str) -> list[Mutant]:
             for statement in node.body:
                 visit(statement, (0, 0, compiled), False)
             for default in [*node.args.defaults, *filter(None, node.args.kw_defaults)]:
-                visit(default, (node.lineno, node.lineno, True), False)
+                visit(default, (node.lineno, default.lineno, True), False)
             return
         if isinstance(node, ast.ClassDef):
             for statement in node.body:

@@ -236,3 +236,12 @@ def test_the_floor_is_what_noise_makes_of_a_balanced_grasp_on_average():
 
 def test_without_noise_there_is_no_floor():
     assert Grasp(q=[0.0], contacts=[contact()], jacobian=np.zeros((3, 1))).floor == (0.0, 0.0)
+
+
+def test_centres_of_round_tips_are_their_radius_beyond_the_touch():
+    contacts = [
+        Contact([0.1, 0.0, 0.2], [0.0, 0.6, 0.8], tip_radius=0.01),
+        Contact([0.0, 0.3, 0.0], [1.0, 0.0, 0.0]),
+    ]
+    grasp = Grasp(np.zeros(2), contacts, np.zeros((6, 2)))
+    np.testing.assert_allclose(grasp.centers, [[0.1, 0.006, 0.208], [0.0, 0.3, 0.0]])

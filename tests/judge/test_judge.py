@@ -470,7 +470,7 @@ def test_a_wrench_acts_at_the_objects_middle_in_the_world(bench, pushed):
     due[1 if pushed else 5] = 0.1 / 0.4 if pushed else 1e-4 / inertia[about]
     np.testing.assert_allclose(speed, due, atol=1e-6 * np.abs(due).max())
     data = bench._forward()
-    palm = bench.robot.model.body(bench.robot.palm_body).name
+    palm = bench.robot.model.body(bench.robot.groups[0].palm_body).name
     R, origin = data.body(palm).xmat.reshape(3, 3), data.body(palm).xpos
     place = R.T @ (data.body("object").xpos - origin)
     np.testing.assert_allclose(poses[-1, :3], place, atol=1e-3)

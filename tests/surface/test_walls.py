@@ -393,3 +393,13 @@ def test_walls_turn_normals_around_their_axis_and_not_along_it():
         np.testing.assert_allclose(turn[i] @ around, (ahead - behind) / (2.0 * h), atol=0.01)
         np.testing.assert_allclose(turn[i] @ UP, 0.0, atol=1e-12)
         np.testing.assert_allclose(turn[i] @ n, 0.0, atol=1e-12)
+
+
+def test_two_rims_beside_the_sides_do_not_turn_the_axis_at_all():
+    """What leans by more than an end face's rim does has no say once the axis is about known."""
+    sides = on_circle(0.05, *range(0, 360, 30)).felt.contacts
+    n = np.array([0.8, 0.0, 0.6])
+    rims = [Contact([0.05, 0.01 * i, 0.06], n, tip_radius=TIP) for i in range(2)]
+    grasp = Grasp(np.zeros(2), (*sides, *rims), np.zeros((42, 2)))
+    axis = Felt.of([Touch(grasp.q, grasp)]).axis(grasp)
+    np.testing.assert_allclose(axis, UP, atol=1e-5)
