@@ -213,7 +213,7 @@ def test_an_unknown_object_lists_the_known_ones(thing):
 
 
 def test_an_unknown_robot_is_refused_before_anything_is_compiled():
-    with pytest.raises(InputError, match=r"unknown robot 'hook'.*bhand, umass_torso, wam_bhand"):
+    with pytest.raises(InputError, match=r"unknown robot 'hook'.*bhand, .*umass_torso, wam_bhand"):
         Scene(robot="hook")
 
 
