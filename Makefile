@@ -19,6 +19,7 @@ READY_DEV := $(VENV)/.ready-dev
 READY_ALL := $(VENV)/.ready-all
 READY_BENCH := $(VENV)/.ready-bench
 READY_OUTSIDE := $(VENV)/.ready-outside
+READY_PACKAGE := $(VENV)/.ready-package
 # The oldest dependencies that pyproject.toml admits, with the oldest Python where there is one, in an
 # environment of their own. It keeps the compiled solver too: two numbas would overwrite each other's.
 OLDEST := .venv-oldest
@@ -31,7 +32,7 @@ BOUNDS := $(PY) -c 'import tomllib; \
 unexport PYTHONPATH PYTHONHOME
 export NO_MKDOCS_2_WARNING := 1  # mkdocs-material's notice; pyproject.toml holds mkdocs below 2
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-oldest lint docs pictures bench outside mutants results clean
+.PHONY: help demo test test-all test-oldest lint package docs pictures bench outside mutants results clean
 .NOTPARALLEL:
 
 help:
@@ -40,6 +41,7 @@ help:
 	@echo 'make test-all    the same, then the slow tests, which drive a browser (chromium) and a Dask cluster'
 	@echo 'make test-oldest   run the tests with the oldest dependencies admitted, in .venv-oldest'
 	@echo 'make lint    ruff and mypy only'
+	@echo 'make package   build sdist and wheel into dist/, check them, and grasp with the wheel in an empty environment'
 	@echo 'make docs    build the site into site/'
 	@echo 'make pictures   draw the laws and the grasp on the front page into docs/ (needs chromium)'
 	@echo 'make bench   compare with peers, print ratios'
@@ -66,6 +68,21 @@ lint: $(READY_DEV)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+
+# Far from this folder, so that nothing of it is imported by chance. The doctor says how long the first
+# call took.
+package: $(READY_PACKAGE)
+	rm -rf build dist *.egg-info
+	$(PY) -m build
+	$(PY) -m twine check --strict dist/*
+	@set -e; away=$$(mktemp -d); trap 'rm -rf "$$away"' EXIT; \
+	  $(PY) -m venv "$$away/venv"; \
+	  "$$away/venv/bin/python" -m pip install --quiet --no-input --disable-pip-version-check dist/*.whl; \
+	  cd "$$away"; unset VIRTUAL_ENV; \
+	  venv/bin/hqp-grasp doctor; \
+	  venv/bin/hqp-grasp run cylinder --trials 1 --probes 3 --out results; \
+	  venv/bin/python -m hqp_grasp robot umass_torso --hand left > /dev/null; \
+	  echo "in the environment: $$(du -sm venv | cut -f1) MB, of which hqp_grasp $$(du -sk venv/lib/python*/site-packages/hqp_grasp | cut -f1) kB"
 
 docs: $(READY_DEV)
 	$(SITE)
@@ -151,6 +168,7 @@ results: $(READY_BENCH) pictures
 	$(call keep,polygons,benchmarks/polygons.py --polygons 20 --starts 50 --seed 0)
 	$(call keep,caps,benchmarks/caps.py --trials 200 --seed 90)
 	$(call keep,probing,benchmarks/probing.py)
+	$(call keep,kinematics,benchmarks/kinematics.py)
 	$(call keep,damage,benchmarks/damage.py --damages 2000 --seed 20)
 	$(call keep,probing-joints,benchmarks/probing.py --robots bhand wam_bhand umass_torso --joints 8 16 24 32 40)
 	$(call keep,short-of-joints,benchmarks/short_of_joints.py --configurations 2000 --seed 0)
@@ -212,6 +230,11 @@ $(READY_BENCH): pyproject.toml $(MADE)
 	@$(PIP) --editable '.[bench,cluster]'
 	@$(COMPILE)
 	@touch $(READY) $@
+
+$(READY_PACKAGE): pyproject.toml $(MADE)
+	@echo 'Installing what builds and checks packages into $(VENV) (once)'
+	@$(PIP) --editable '.[package]'
+	@touch $@
 
 # Only their model files are wanted: none of these packages is imported.
 $(READY_OUTSIDE): $(READY)

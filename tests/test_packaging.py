@@ -1,7 +1,8 @@
-"""The Makefile runs what README and docs quote."""
+"""The Makefile runs what README and docs quote, and the wheel has all that the package needs."""
 
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -37,3 +38,23 @@ def test_what_a_page_quotes_is_run_by_make_results(run, command):
         assert any(set(command) <= set(line) for line in run)
     else:
         assert command in run
+
+
+def test_every_folder_of_the_package_is_in_the_wheel():
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "setuptools"
+    ]
+    rooms = [p.parent.relative_to(ROOT) for p in ROOT.glob("hqp_grasp/**/__init__.py")]
+    own = {".".join(room.parts) for room in rooms}
+    assert set(tool["packages"]) == own | set(tool["package-dir"])
+    assert len(tool["packages"]) == len(set(tool["packages"]))
+
+
+def test_a_package_says_what_it_is_and_what_each_requirement_is_for():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for field in ("description", "readme", "license", "authors", "keywords", "classifiers"):
+        assert project[field]
+    assert len(project["description"]) < 512
+    cff = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"version: {project['version']}\n" in cff and f"license: {project['license']}\n" in cff
+    assert f"name: {project['authors'][0]['name']}\n" in cff
