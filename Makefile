@@ -9,7 +9,7 @@ PY := $(VENV)/bin/python
 HQP := $(VENV)/bin/hqp-grasp
 PIP := $(PY) -m pip install --quiet --no-input --disable-pip-version-check
 # numba compiles the solver at its first call and keeps what it made: half a minute, once.
-COMPILE := $(PY) -c 'import numpy as n, hqp_grasp as h; h.HQP().solve([h.Level.equal(n.eye(2), n.ones(2))])'
+COMPILE := $(HQP) doctor > /dev/null
 # Never --quiet, under which mkdocs counts no warning and so passes a broken link.
 SITE := $(PY) -m mkdocs build --strict
 # One stamp for each state of $(VENV), so that nothing is installed twice.

@@ -17,9 +17,14 @@ from numba.core import event
 
 from hqp_grasp import kernels
 from hqp_grasp.errors import requirements
+from hqp_grasp.experiments.trial import Trial
 from hqp_grasp.hierarchy import active_set
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.hierarchy.level import Level
+from hqp_grasp.tasks import stack_of
+from hqp_grasp.world.clearance import SelfClearance
+from hqp_grasp.world.description import CLEARANCE
+from hqp_grasp.world.scene import Scene
 
 BROWSERS = ("chromium", "chromium-browser")  # what `make test-all` drives
 RENDERER = """
@@ -33,7 +38,7 @@ PATIENCE = 60.0  # [s] for a renderer to answer
 
 
 def doctor() -> str:
-    """The report. It solves a problem, so that the solver is compiled when it returns."""
+    """The report. It tries all that is compiled, so that nothing is left to compile after it."""
     needed = requirements()
     lines = [
         f"hqp_grasp  {version('hqp_grasp')}, {Path(kernels.__file__).parent}",
@@ -62,24 +67,28 @@ def _versions(packages: dict[str, str]) -> str:
 
 
 def _solver() -> str:
-    """Whether the kernels were compiled before, tried on one problem, and where they are kept."""
+    """Whether all kernels were compiled before, tried one by one, and where they are kept."""
     with event.install_recorder("numba:compile") as recorder:
         began = time.perf_counter()
         levels = [Level.equal(np.eye(2), np.ones(2))]
         solution = HQP().solve(levels)
-        took = time.perf_counter() - began
+        scene = Scene("bhand")
+        Trial(scene, stack_of("fmk"), probes=1).run(1)
+        SelfClearance(scene.articulated, CLEARANCE).near(scene.articulated.home, CLEARANCE)
+    took = time.perf_counter() - began
     if not solution.is_optimal(levels):
         return f"NOT RIGHT: {solution.method} found no certified answer to a trivial problem"
     compiled = any(
         each.data["dispatcher"].py_func.__module__.startswith("hqp_grasp.")
         for _, each in recorder.buffer
     )
-    how = "compiled just now" if compiled else "compiled before"
+    how = "compiled just now" if compiled else "compiled before, and loaded"
+    how = f"{how}, in {took:.1f} s"
     if kernels.homeless:
-        return f"{how}; first answer after {took:.1f} s\n{kernels.HOMELESS}"
+        return f"{how}\n{kernels.HOMELESS}"
     dispatcher: Any = active_set.spectral_norm
     kept = dispatcher.stats.cache_path
-    return f"{how}; first answer after {took:.1f} s; kept in {kept}"
+    return f"{how}; kept in {kept}"
 
 
 def _browser() -> str:
