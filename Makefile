@@ -81,7 +81,8 @@ package: $(READY_PACKAGE)
 	  cd "$$away"; unset VIRTUAL_ENV; \
 	  venv/bin/hqp-grasp doctor; \
 	  venv/bin/hqp-grasp run cylinder --trials 1 --probes 3 --out results; \
-	  venv/bin/python -m hqp_grasp robot umass_torso --hand left > /dev/null; \
+	  venv/bin/hqp-grasp robot umass_torso --hand left > /dev/null; \
+	  venv/bin/python -m hqp_grasp --version; \
 	  echo "in the environment: $$(du -sm venv | cut -f1) MB, of which hqp_grasp $$(du -sk venv/lib/python*/site-packages/hqp_grasp | cut -f1) kB"
 
 docs: $(READY_DEV)
