@@ -164,8 +164,8 @@ class Start:
                 if min(place.distance for place in places) <= 0.0:
                     return no
                 reached = _placed(scene, q, fixed, places)
-                if reached is None:
-                    return _Rejected(ARM, ARM)
+                if isinstance(reached, _Rejected):
+                    return reached
                 placed, q = reached  # the next posture is near this one
                 felt = probe_in(placed).touch(q)
                 if isinstance(felt, Grasp):
@@ -303,8 +303,8 @@ def _extent(scene: Scene) -> float:
 
 def _placed(
     scene: Scene, q: np.ndarray, fixed: list[int], places: Sequence[_Place]
-) -> tuple[Scene, np.ndarray] | None:
-    """Joints, from q on, that bring the palms to their places; None where no step is shown to."""
+) -> tuple[Scene, np.ndarray] | _Rejected:
+    """Joints, from q on, that bring the palms to their places, or whose arm no step is shown to."""
     robot = scene.articulated
     for g, place in enumerate(places):
         p_palm = place.position(np.array(scene.position))
@@ -317,6 +317,7 @@ def _placed(
         keep = fixed if len(places) == 1 else others
         found = reach(robot, q, p_palm, R_palm, keep, group=g)
         if found is None:
-            return None
+            several = f" ({robot.groups[g].name})" if len(places) > 1 else ""
+            return _Rejected(ARM, ARM + several)
         q = found
     return scene, q
