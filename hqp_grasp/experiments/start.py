@@ -202,7 +202,7 @@ class Start:
             while law.error(found[1])[list(group.points)].max() > self.lean:
                 there = replace(places[g], distance=places[g].distance - self.advance)
                 reached = _placed(scene, found[1].q, fixed, [*places[:g], there, *places[g + 1 :]])
-                if reached is None:
+                if isinstance(reached, _Rejected):
                     break
                 felt = probe_in(reached[0]).touch(reached[1])
                 if not isinstance(felt, Grasp) or felt.other_links:

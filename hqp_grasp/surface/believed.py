@@ -23,7 +23,8 @@ def believed(felt: Felt, grasp: Grasp, goal: float) -> Surface:
     count as such where that is more than `goal` [N²], and more than noise explains.
     """
     axis = felt.axis(grasp)
-    on_sides = (np.abs(grasp.normals @ axis) < LEANING).all()
+    balls = np.array([contact.stretch is None for contact in grasp.contacts])
+    on_sides = (np.abs(grasp.normals @ axis)[balls] < LEANING).all()
     lean = np.abs(felt.normals @ axis)
     upright = np.maximum(np.sqrt(goal) / grasp.k, SURE * felt.noise)
     leaning = (lean > upright) & (lean < END) & felt.by_balls

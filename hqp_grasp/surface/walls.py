@@ -51,11 +51,15 @@ class Walls:
 
     def turn(self, grasp: Grasp) -> np.ndarray:
         """∂n_i/∂c_i (k, 3, 3) [1/m]: around the axis as the nearest ball felt, not along it."""
-        away = np.linalg.norm(grasp.positions[:, None] - self.felt.positions, axis=2)
-        radius = self.felt.radii[away.argmin(axis=1)] + self.outline.tip_radius
+        radius = self._radii(grasp) + self.outline.tip_radius
         around = np.cross(self.axis, grasp.normals)
         blocks = around[:, :, None] * around[:, None]
         return np.asarray(blocks / np.maximum(radius, SLACK)[:, None, None])
+
+    def _radii(self, grasp: Grasp) -> np.ndarray:
+        """Of the balls of the nearest points felt (k,) [m]."""
+        away = np.linalg.norm(grasp.positions[:, None] - self.felt.positions, axis=2)
+        return np.asarray(self.felt.radii[away.argmin(axis=1)])
 
     def reach(self, u: np.ndarray) -> np.ndarray:
         """As far (m,) [m] along u (m, 3) as was felt: where walls end is not known."""
@@ -64,12 +68,15 @@ class Walls:
     def ways(self, grasp: Grasp) -> list[WayAround]:
         """Ways around the outline that differ, the cheapest first.
 
-        Heights z_i change by the least that makes Σ z_i n_i vanish, as the moment of forces across
-        the axis does: two or three forces balance at one height only, of more there is a choice.
+        A contact whose normal leans, as where a tip that is no ball touches with an edge of its
+        own, belongs at the height of its ball's middle. From there heights z_i change by the least
+        that makes Σ z_i n_i vanish, as the moment of forces across the axis does: two or three
+        forces balance at one height only, of more there is a choice.
         """
         s = self.outline.locate(grasp.centers @ self.outline.frame.T)
         cost, places = self.outline.balanced(s)
-        own, ways = grasp.centers @ self.axis, []
+        middles = grasp.positions - self._radii(grasp)[:, None] * grasp.normals
+        own, ways = middles @ self.axis, []
         for i in distinct(cost, places[:, :, None]):
             n = directions(self.outline.at(places[i])[0]).T
             height = own - np.linalg.pinv(n, rcond=FLATTEST) @ (n @ own)

@@ -117,5 +117,7 @@ def test_aligned_palms_face_what_they_touch(pads):
 
 def test_an_object_out_of_reach_of_one_hand_is_told_with_the_hand():
     scene = hg.Scene("umass_torso", DRUM, position=(0.55, 0.6, 0.8), hand="both")
-    with pytest.raises(hg.ReachError, match=r"the arm cannot reach the drawn posture \((left|right)\)"):
+    with pytest.raises(
+        hg.ReachError, match=r"the arm cannot reach the drawn posture \((left|right)\)"
+    ):
         first_touch(scene)
