@@ -36,7 +36,7 @@ def test_six_tips_and_two_palms_balance_a_drum(tips, pads, seed):
         record = hg.Trial(scene, hg.stack_of("fm"), probes=12).run(seed=(7, seed))
         assert record.verdict == "good" and record.grasps[-1].k == k
         goal = record.column("goal_f")
-        np.testing.assert_allclose(goal, 1e-3 * (k / 3) ** 2)
+        assert np.nanmax(np.abs(goal - 1e-3 * (k / 3) ** 2)) < 1e-15
 
 
 def test_contacts_tell_their_group_and_frames_their_palm(tips):
