@@ -125,9 +125,9 @@ class LinkBalls:
                 centers.append(middle + s * axis)
                 radii.append(radius)
         put = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
-        put("bodies", np.array(bodies))
-        put("centers", np.array(centers))
-        put("radii", np.array(radii))
+        put("bodies", np.array(bodies, dtype=int))
+        put("centers", np.reshape(centers, (-1, 3)))
+        put("radii", np.array(radii, dtype=float))
 
     def depth(self, q: np.ndarray, u: np.ndarray, h: np.ndarray) -> float:
         """How deep [m] the deepest ball is in {x: u·x ≤ h}, u (m, 3) and h (m,) [m]; < 0: clear."""

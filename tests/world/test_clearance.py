@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import numpy as np
 import pytest
+import tiny_hand
 from tiny_hand import change
 
 from hqp_grasp.world.clearance import LinkBalls, SelfClearance
@@ -285,3 +286,12 @@ def test_links_are_as_deep_as_the_deepest_ball_is_in_the_half_spaces(tmp_path):
     cube = np.vstack([np.eye(3), -np.eye(3)])
     side = np.array([0.5, 0.5, -0.9, 0.5, 0.5, 1.0])  # 0.9 m below: nothing is there
     assert balls.depth(q, cube, side) < 0.0
+
+
+def test_a_robot_of_tips_alone_has_no_link_to_keep_out_of_the_object(tmp_path):
+    about = RobotDescription.load(tiny_hand.write(tmp_path))
+    robot = Robot(about, compiled(about))
+    balls = LinkBalls(robot)
+    assert balls.centers.shape == (0, 3) and balls.bodies.dtype == int
+    u, h = np.array([[1.0, 0.0, 0.0]]), np.array([0.5])
+    assert balls.depth(robot.home, u, h) == -np.inf
