@@ -196,15 +196,13 @@ def test_a_model_in_the_place_of_a_description_is_told_how_to_get_one(tmp_path):
             hg.Scene(given)
 
 
-def test_two_hands_are_not_mixed(tmp_path):
-    one = hand()[hand().index('<body name="palm">') : hand().index("</worldbody>")]
-    two = one.replace('"palm"', '"palm2"')
-    two = re.sub(r'name="([abc])', r'name="2\1', two)
-    text = hand().replace("</worldbody>", two + "</worldbody>")
-    text = draft(write(tmp_path, text))
-    said = data(text)
-    assert tips(text) == ["a2", "b2", "c2"] and "# Left out: 2a2, 2b2, 2c2" in text
-    assert said["model"] == [{"file": "own.xml", "root": "palm"}]
+def test_of_two_hands_the_one_with_more_fingers_is_described_and_they_are_not_mixed(tmp_path):
+    two = hand((0, 180))
+    two = two[two.index('<body name="palm">') : two.index("</worldbody>")]
+    two = re.sub(r'name="([ab])', r'name="2\1', two.replace('"palm"', '"palm2"'))
+    text = draft(write(tmp_path, hand(beside=two)))
+    assert tips(text) == ["a2", "b2", "c2"] and "# Left out: 2a2, 2b2" in text
+    assert data(text)["model"] == [{"file": "own.xml", "root": "palm"}]
 
 
 @pytest.mark.parametrize("name", ["allegro", "baxter", "fourier", "inspire", "robotiq", "shadow"])
