@@ -116,6 +116,8 @@ $(HQP) judge $(RESULTS)/judged-$(1) --force 1 --protocol dexgraspbench >> $(RESU
 endef
 study = $(HQP) run $(1) --trials 1000 --probes 40 --seed 2026 $(3) --out $(RESULTS)/$(1)$(2) > $(RESULTS)/$(1)$(2).txt
 
+two_arms = $(HQP) run $(1) --hand $(2) --stack $(3) --trials 100 --probes 30 --seed 2027 --out $(RESULTS)/$(1)-$(2) > $(RESULTS)/$(1)-$(2).txt
+
 results: $(READY_BENCH) pictures
 	rm -rf $(RESULTS)
 	mkdir -p $(RESULTS)
@@ -135,6 +137,11 @@ results: $(READY_BENCH) pictures
 	$(call study,cylinder,-pass,--links pass)
 	$(call study,cylinder,-eq7,--kinematic-error eq7)
 	$(call study,cylinder,-no-landing,--no-landing)
+	$(call two_arms,drum,both,fm)
+	$(call two_arms,box,both,fm)
+	$(call two_arms,drum,palms,fma)
+	$(call two_arms,box,palms,fma)
+	$(call two_arms,beam,palms,fma)
 	$(HQP) report $(RESULTS)/cylinder $(RESULTS)/cylinder-* > $(RESULTS)/report-cylinder.txt
 	$(HQP) report $(RESULTS)/hexagon $(RESULTS)/hexagon-* > $(RESULTS)/report-hexagon.txt
 	cp $(RESULTS)/cylinder/convergence.png docs/images/cylinder-convergence.png
