@@ -68,15 +68,16 @@ class Walls:
     def ways(self, grasp: Grasp) -> list[WayAround]:
         """Ways around the outline that differ, the cheapest first.
 
-        A contact whose normal leans, as where a tip that is no ball touches with an edge of its
-        own, belongs at the height of its ball's middle. From there heights z_i change by the least
-        that makes Σ z_i n_i vanish, as the moment of forces across the axis does: two or three
-        forces balance at one height only, of more there is a choice.
+        Where a tip that is no ball touches with an edge of its own, its normal leans, and it
+        belongs at the height of its ball's middle. From there heights z_i change by the least that
+        makes Σ z_i n_i vanish, as the moment of forces across the axis does: two or three forces
+        balance at one height only, of more there is a choice.
         """
         s = self.outline.locate(grasp.centers @ self.outline.frame.T)
         cost, places = self.outline.balanced(s)
         middles = grasp.positions - self._radii(grasp)[:, None] * grasp.normals
-        own, ways = middles @ self.axis, []
+        balls = np.array([contact.stretch is None for contact in grasp.contacts])
+        own, ways = np.where(balls[:, None], grasp.centers, middles) @ self.axis, []
         for i in distinct(cost, places[:, :, None]):
             n = directions(self.outline.at(places[i])[0]).T
             height = own - np.linalg.pinv(n, rcond=FLATTEST) @ (n @ own)
