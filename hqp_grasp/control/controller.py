@@ -161,7 +161,7 @@ class Controller:
         if way is None or not self.robot.arm:
             return Step(None, reason="no touch has felt a grasp: begin where the hand touches")
         group = self.robot.group_of(missed.where)
-        postures = carried(self.robot, np.clip(q, *self._ranges), way, group)
+        postures = carried(self.robot, np.clip(q, *self._ranges), way, [group])
         if postures is None:
             return Step(q, reason="the same again: the arm cannot go beside")
         q = np.clip(postures[-1], *self._ranges)

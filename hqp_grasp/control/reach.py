@@ -54,22 +54,27 @@ def reach(
     return None
 
 
-def carried(robot: Robot, q: np.ndarray, by: np.ndarray, group: int = 0) -> list[np.ndarray] | None:
-    """Postures (n,) [rad] along which an arm moves its palm straight by `by` (3,) [m], world.
+def carried(
+    robot: Robot, q: np.ndarray, by: np.ndarray, groups: Sequence[int] | None = None
+) -> list[np.ndarray] | None:
+    """Postures (n,) [rad] along which arms move palms straight by `by` (3,) [m], world.
 
-    The hand keeps its joints, the palm its orientation; an arm with joints to spare moves them as
-    little as it can. None where it cannot go all the way.
+    Those of `groups`, or all. Hands keep their joints, palms their orientation; an arm with joints
+    to spare moves them as little as it can. None where one cannot go all the way.
     """
-    p_palm, R_palm = robot.palm(q, group)
-    hand = [j for j in range(robot.n) if j not in robot.groups[group].arm]
+    chosen = range(len(robot.groups)) if groups is None else groups
+    palms = {g: robot.palm(q, g) for g in chosen}
     count = max(1, int(np.ceil(np.linalg.norm(by) / APART)))
     way: list[np.ndarray] = []
     for share in np.arange(1, count + 1) / count:
-        start = way[-1] if way else q
-        found = reach(robot, start, p_palm + share * by, R_palm, hand, 0.0, group)
-        if found is None:
-            return None
-        way.append(found)
+        there = way[-1] if way else q
+        for g, (p_palm, R_palm) in palms.items():
+            keep = [j for j in range(robot.n) if j not in robot.groups[g].arm]
+            found = reach(robot, there, p_palm + share * by, R_palm, keep, 0.0, g)
+            if found is None:
+                return None
+            there = found
+        way.append(there)
     return way
 
 

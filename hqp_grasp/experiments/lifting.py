@@ -13,7 +13,7 @@ from hqp_grasp.errors import InputError, instance, positive
 from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.touch.driver import Driver, require_press
 from hqp_grasp.touch.geometric import RETREAT
-from hqp_grasp.touch.physical import PhysicalProbe
+from hqp_grasp.touch.physical import BACKING, PhysicalProbe
 from hqp_grasp.world.robot import Robot
 
 G = 9.81  # [m/s²]
@@ -113,10 +113,18 @@ def lift(
 
 
 def _let_go(driver: Driver, robot: Robot) -> str:
-    """Press ever less, then open; return what stopped the hand meanwhile, empty if nothing did."""
+    """Press ever less, then open; return what stopped the hand meanwhile, empty if nothing did.
+
+    Palms on several sides draw off first: fingers that lean may be wedged on the object.
+    """
     driver.press(np.zeros(robot.n))
     driver.wait(RELEASING)
     here = np.clip(driver.wait(0.0).q[-1], driver.limits.lower, driver.limits.upper)
+    if len(robot.groups) > 1:
+        here = robot.withdrawn(here, np.full(len(robot.groups), BACKING))
+        fault = driver.wait(driver.move(here, OPENING)).fault
+        if fault:
+            return fault
     opened = here - RETREAT * robot.closing.sum(axis=0)
     opened = np.clip(opened, driver.limits.lower, driver.limits.upper)
     return driver.wait(driver.move(opened, OPENING)).fault

@@ -433,13 +433,14 @@ def _silent(readings: Readings) -> np.ndarray:
 def _own_links(robot: Robot) -> tuple[tuple[int, list[int]], ...]:
     """Each tip's geom, and those of the robot that it can meet: all but its own finger's links."""
     model = robot.model
-    tips, arm = [geoms[0] for geoms in robot.geoms], robot.groups[0].palm_body
+    tips = [geoms[0] for geoms in robot.geoms]
+    palms = {i: group.palm_body for group in robot.groups for i in group.points}
     moving = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] != 0]
     touching = [g for g in moving if model.geom_contype[g] or model.geom_conaffinity[g]]
     found = []
-    for tip in tips:
+    for i, tip in enumerate(tips):
         finger, body = set(), int(model.geom_bodyid[tip])
-        while body not in (0, arm):
+        while body not in (0, palms[i]):
             finger.add(body)
             body = int(model.body_parentid[body])
         found.append((tip, [g for g in touching if model.geom_bodyid[g] not in finger]))

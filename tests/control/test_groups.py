@@ -7,6 +7,7 @@ import pytest
 
 import hqp_grasp as hg
 from hqp_grasp.control.controller import Controller
+from hqp_grasp.control.reach import carried
 from hqp_grasp.grasp import Grasp, Miss, Missed, Touch
 from hqp_grasp.touch.geometric import WITHDRAWAL, GeometricProbe
 
@@ -121,3 +122,12 @@ def test_an_object_out_of_reach_of_one_hand_is_told_with_the_hand():
         hg.ReachError, match=r"the arm cannot reach the drawn posture \((left|right)\)"
     ):
         first_touch(scene)
+
+
+def test_all_palms_are_carried_together_or_those_that_are_named(tips):
+    robot, q, by = tips.articulated, first_touch(tips).q, np.array([0.0, 0.0, 0.05])
+    for groups, rises in ((None, (0.05, 0.05)), ([1], (0.0, 0.05))):
+        end = carried(robot, q, by, groups)[-1]
+        for g, rise in enumerate(rises):
+            moved = robot.palm(end, g)[0] - robot.palm(q, g)[0]
+            np.testing.assert_allclose(moved, [0.0, 0.0, rise], atol=2e-4)
