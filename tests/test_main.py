@@ -120,7 +120,7 @@ def test_the_doctor_tells_versions_and_what_is_missing_and_that_the_solver_works
     monkeypatch, capsys
 ):
     monkeypatch.setattr("shutil.which", lambda name: None)
-    extra = {"view": {"viser": "viser>=1.1.1", "no-such-viewer": "no-such-viewer>=2"}}
+    extra = {"view": {"tyro": "tyro>=1.0", "no-such-viewer": "no-such-viewer>=2"}}
     found = {"": {"numpy": "numpy>=2.0"}} | extra
     monkeypatch.setattr("hqp_grasp.experiments.doctor.requirements", lambda: found)
     call(monkeypatch, "doctor")
