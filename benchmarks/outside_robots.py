@@ -48,6 +48,8 @@ CASES = {
     "inspire, 30 mm": Case("inspire", hg.Cylinder(0.03)),
     "fourier, 30 mm": Case("fourier", hg.Cylinder(0.03)),
     "baxter, 120 mm": Case("baxter", hg.Cylinder(0.12)),
+    "g1 arms, 120 mm": Case("g1", hg.Cylinder(0.12), "both"),
+    "g1 arms, 160 mm": Case("g1", hg.Cylinder(0.16), "both"),
     "torso right, 50 mm": Case("umass_torso", hg.Cylinder(0.05), "right"),
     "torso left, 50 mm": Case("umass_torso", hg.Cylinder(0.05), "left"),
     "torso right, hexagon": Case("umass_torso", HEXAGON, "right"),

@@ -150,25 +150,29 @@ def _contact_points(robot: Robot) -> list[str]:
     about, model = robot.description, robot.model
     lines = ["contact points"]
     J = robot.jacobian(robot.home).reshape(-1, 3, robot.n)
-    x = robot.centers(robot.home)
+    x, ways = robot.centers(robot.home), robot.closing_at(robot.home)
+    arms = {i: group.name for group in robot.groups for i in group.points}
     for i, point in enumerate(about.contact_points):
         kinds = [_shape(model, g) for g in robot.geoms[i]]
         closing = ", ".join(
             f"{robot.joints[j]} {robot.closing[i, j]:+.2g}" for j in robot.flexion[i]
         )
+        if point.by_arm:
+            closing = f"the arm of {arms[i]}, straight along its palm's approach axis"
         found = "" if point.closing is not None else " (found by itself; flexion = {…} says other)"
         lines.append(f"  {point.name} on {point.link or _link(robot, i)}: {', '.join(kinds)}")
-        lines.append(f"    closes with {closing or 'nothing'}{found}")
+        lines.append(f"    closes with {closing}{found}")
         others = np.delete(x, i, axis=0)
-        if len(others) and robot.closing[i].any():
+        if len(others):
             towards = others.mean(axis=0) - x[i]
             if np.linalg.norm(towards) < CENTRED:
                 lines.append("    at home it is amid the others, and moves towards none")
                 continue
-            speed = float(J[i] @ robot.closing[i] @ towards / np.linalg.norm(towards))
+            speed = float(J[i] @ ways[i] @ towards / np.linalg.norm(towards))
             way = "towards" if speed > 0.0 else "AWAY FROM"
-            lines.append(f"    at home it moves {way} the others at {1e3 * speed:+.0f} mm/rad")
-    if len(x) > 1:
+            per = "m" if point.by_arm else "rad"
+            lines.append(f"    at home it moves {way} the others at {1e3 * speed:+.0f} mm/{per}")
+    if len(x) > 1 and robot.closing.any():
         radii = [_spread(robot.centers(robot.opened(robot.home, s))) for s in CLOSINGS]
         lines.append(
             f"  as they close, tips are {1e3 * radii[0]:.0f} … {1e3 * min(radii):.0f} mm from "
@@ -258,7 +262,7 @@ def draw(robot: Robot, path: str | Path) -> None:
             axes.plot(*ends.T, color="0.5", linewidth=2)
     x = robot.centers(robot.home)
     J = robot.jacobian(robot.home).reshape(-1, 3, robot.n)
-    ways = np.einsum("kan,kn->ka", J, robot.closing)
+    ways = np.einsum("kan,kn->ka", J, robot.closing_at(robot.home))
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
     axes.scatter(*x.T, color="tab:orange")
     axes.quiver(*x.T, *ways.T, length=0.04, color="tab:orange", label="closing")

@@ -912,6 +912,10 @@ def _contact_point(data: object) -> ContactPoint:
         closing = {
             joint: _number(f"flexion of {joint}", weight) for joint, weight in flexion.items()
         }
+    elif isinstance(flexion, str):
+        raise InputError(
+            f'flexion must be "arm", a list of joints, or {{ JOINT = weight }}; got {flexion!r}'
+        )
     else:
         closing = None if flexion is None else dict.fromkeys(_texts(flexion), 1.0)
     geoms = (_text(data["geom"]),) if "geom" in data else _texts(data.get("geoms", []))

@@ -159,6 +159,23 @@ class Robot:
         put("flexion", tuple(tuple(np.flatnonzero(w).tolist()) for w in self.closing))
         put("groups", tuple(self._groups()))
         put("arm", tuple(sorted({j for group in self.groups for j in group.arm})))
+        self._refuse_sidelong()
+
+    def _refuse_sidelong(self) -> None:
+        """Raise where an arm that is to close a contact point does not bring it on, at home."""
+        ways = self.closing_at(self.home)
+        J = self.jacobian(self.home).reshape(-1, 3, self.n)
+        for g, group in enumerate(self.groups):
+            axis = self.palm(self.home, g)[1][:, 2]
+            for i in group.points:
+                point = self.description.contact_points[i]
+                if point.by_arm and axis @ J[i] @ ways[i] < SINGULAR:
+                    arm = ", ".join(self.joints[j] for j in group.arm)
+                    raise ModelError(
+                        f"the arm of group {group.name!r} of {self.description.name}, {arm}, does "
+                        f"not bring {point.name!r} on along the palm's approach axis "
+                        f"{np.round(axis, 3)} at home: another home, palm or arm"
+                    )
 
     def _refuse_stuck(self, names: Sequence[str]) -> None:
         """Raise where couplings leave a joint no range, or a single angle."""
@@ -227,6 +244,11 @@ class Robot:
                     closing[i, self.index(joint)] = weight
             if closing[i].any():
                 closing[i] /= np.abs(closing[i] / unit).max()
+            elif not point.by_arm:
+                raise ModelError(
+                    f"flexion of {point.name!r} of {self.description.name} weighs no joint, so "
+                    'nothing can close it: flexion = { JOINT = 1.0 }, or "arm"'
+                )
         for i, point in enumerate(points):
             for j in np.flatnonzero(closing[i]):
                 others = [p.name for a, p in enumerate(points) if a != i and moves[a, j]]
@@ -305,6 +327,12 @@ class Robot:
         for group in about.grasping:
             points = tuple(range(first, first + len(group.contact_points)))
             first = points[-1] + 1
+            carried = [i for i in points if about.contact_points[i].by_arm]
+            if carried and group.palm is None:
+                raise ModelError(
+                    f"group {group.name!r} of {about.name} closes by its arm, along its palm's "
+                    "approach axis: it needs palm = { body = BODY, pos, approach, opposition }"
+                )
             body, p, R = self._palm_of(group, points)
             if group.arm is None:
                 carries = np.abs(self.coupling[_chain(self.model, body)]).sum(axis=0) > 0.0
@@ -319,7 +347,6 @@ class Robot:
                         f"{self.joints[j]!r}: groups that grasp together have an arm each, "
                         "arm = [...] says which joints"
                     )
-            carried = [i for i in points if about.contact_points[i].by_arm]
             if carried and not arm:
                 raise ModelError(f"group {group.name!r} of {about.name} has no arm to close with")
             if len(carried) > 1:

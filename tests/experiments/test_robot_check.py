@@ -75,6 +75,27 @@ def test_a_finger_that_opens_from_the_others_at_home_is_shouted(tmp_path):
     assert "moves AWAY FROM the others at -112 mm/rad" in check(folder)
 
 
+def test_a_palm_that_its_arm_closes_is_told_as_such_and_shouted_where_it_turns_away(tmp_path):
+    about = RobotDescription.load("umass_torso", "palms")
+    robot = Robot(about, compiled(about))
+    x, way = robot.centers(robot.home), robot.palm(robot.home, 0)[1][:, 2]
+    ahead = 1e3 * way @ (x[1] - x[0]) / np.linalg.norm(x[1] - x[0])
+    assert ahead > 100.0
+    said = check("umass_torso", "palms")
+    assert (
+        "    closes with the arm of right_palm, straight along its palm's approach axis\n"
+        f"    at home it moves towards the others at +{ahead:.0f} mm/m\n"
+    ) in said
+    assert "AWAY" not in said and "as they close" not in said
+    here = about.xml.parent
+    text = (here / "robot.toml").read_text().replace('file = "', f'file = "{here.as_posix()}/')
+    pad = 'name = "right_palm"\npalm = "right_palm"'
+    assert text.count(pad) == 1
+    back = 'name = "right_palm"\npalm = { body = "right_bhand_palm", approach = [0, 0, -1] }'
+    (tmp_path / "robot.toml").write_text(text.replace(pad, back))
+    assert f"AWAY FROM the others at -{ahead:.0f} mm/m" in check(tmp_path, "palms")
+
+
 @pytest.mark.parametrize(
     ("geom", "says"),
     [

@@ -802,18 +802,57 @@ def test_a_coupling_across_groups_is_refused(tmp_path):
     )
 
 
+SLIDING = TORSO % ""  # arm a moves its palm straight along the approach axis, z
+SLIDING = change(SLIDING, 'name="arm_a" axis="1 0 0"', 'name="arm_a" type="slide" axis="0 0 1"')
+BY_ARM = ARMS.replace('flexion = ["close_a"]', 'flexion = "arm"')
+
+
 def test_an_arm_closes_one_contact_point_straight_along_its_palms_axis(tmp_path):
-    toml = ARMS.replace('flexion = ["close_a"]', 'flexion = "arm"')
-    robot = two_arms(tmp_path, toml=toml)
+    robot = two_arms(tmp_path, SLIDING, BY_ARM)
     assert not robot.closing[0].any()
-    way = robot.closing_at(robot.home)[0]
-    assert np.flatnonzero(way).tolist() in ([], [1])  # by its own arm alone
-    more = toml.replace(
+    np.testing.assert_allclose(robot.closing_at(robot.home)[0], [0.0, 1.0, 0.0, 0.0, 0.0])
+    more = BY_ARM.replace(
         'flexion = "arm" }]', 'flexion = "arm" }, { link = "palm_a", flexion = "arm" }]'
     )
-    refused(lambda: two_arms(tmp_path, toml=more), "closes 'tip_a' and 'palm_a'", "can close one")
-    bare = toml.replace('arm = ["arm_a"]', "arm = []")
-    refused(lambda: two_arms(tmp_path, toml=bare), "has no arm to close with")
+    refused(lambda: two_arms(tmp_path, SLIDING, more), "closes 'tip_a' and 'palm_a'", "close one")
+    bare = BY_ARM.replace('arm = ["arm_a"]', "arm = []")
+    refused(lambda: two_arms(tmp_path, SLIDING, bare), "has no arm to close with")
+
+
+@pytest.mark.parametrize(
+    ("xml", "old", "new"),
+    [
+        (TORSO % "", "", ""),  # its one hinge turns the palm on the spot
+        (SLIDING, 'body = "palm_a"', 'body = "palm_a", approach = [0.0, 1.0, 0.0]'),
+        (SLIDING, 'body = "palm_a"', 'body = "palm_b"'),
+        (SLIDING, 'link = "tip_a"', 'link = "waist"'),
+    ],
+)
+def test_an_arm_that_cannot_bring_its_point_on_along_the_axis_is_refused(tmp_path, xml, old, new):
+    toml = change(BY_ARM, old, new) if old else BY_ARM
+    refused(
+        lambda: two_arms(tmp_path, xml, toml),
+        "the arm of group 'a' of ",
+        "arm_a, does not bring '",
+        "on along the palm's approach axis",
+        "another home, palm or arm",
+    )
+
+
+def test_a_palm_whose_arm_closes_must_be_described(tmp_path):
+    toml = change(BY_ARM, 'palm = { body = "palm_a" }\n', "")
+    refused(lambda: two_arms(tmp_path, SLIDING, toml), "group 'a' of ", "it needs palm = { body")
+
+
+@pytest.mark.parametrize("flexion", ["[]", "{}", "{ close_a = 0.0 }"])
+def test_a_finger_that_closes_with_no_joint_is_refused(tmp_path, flexion):
+    toml = change(ARMS, '["close_a"]', flexion)
+    refused(lambda: two_arms(tmp_path, toml=toml), "flexion of 'tip_a' of", "weighs no joint")
+
+
+def test_a_word_that_is_no_way_to_close_is_refused(tmp_path):
+    toml = change(ARMS, '["close_a"]', '"arms"')
+    refused(lambda: two_arms(tmp_path, toml=toml), "flexion must be \"arm\", a list", "got 'arms'")
 
 
 def test_a_hands_own_home_stands_in_place_of_the_robots(tmp_path):
