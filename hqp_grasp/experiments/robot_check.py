@@ -161,9 +161,9 @@ def _contact_points(robot: Robot) -> list[str]:
             closing = f"the arm of {arms[i]}, straight along its palm's approach axis"
         found = "" if point.closing is not None else " (found by itself; flexion = {…} says other)"
         lines.append(f"  {point.name} on {point.link or _link(robot, i)}: {', '.join(kinds)}")
-        lines.append(f"    closes with {closing}{found}")
+        lines.append(f"    closes with {closing or 'nothing'}{found}")
         others = np.delete(x, i, axis=0)
-        if len(others):
+        if len(others) and ways[i].any():
             towards = others.mean(axis=0) - x[i]
             if np.linalg.norm(towards) < CENTRED:
                 lines.append("    at home it is amid the others, and moves towards none")

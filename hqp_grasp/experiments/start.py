@@ -13,6 +13,7 @@ from hqp_grasp.errors import InputError, ReachError, positive, whole
 from hqp_grasp.grasp import Grasp, Miss, as_array
 from hqp_grasp.tasks import KinematicTask
 from hqp_grasp.touch.probe import Probe
+from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.objects import OBJECT
 from hqp_grasp.world.robot import Robot
 from hqp_grasp.world.scene import Scene
@@ -31,10 +32,13 @@ ALIKE = 50
 ARM = "the arm cannot reach the drawn posture"
 SPREAD = "the hand cannot spread as drawn"
 EDGE = "meets an edge or an end of the object"
+OWN = "the robot's own links are in one another"
 REMEDIES = {  # what helps where most draws fail for this
     ARM: "move the object to where the arm can face it, or draw other elevations and offsets "
     "(Start, or `start` in robot.toml)",
     SPREAD: "draw from the spread joint's range (Start.adduction, or `start` in robot.toml)",
+    OWN: "move the object to where the arms have room, or draw other elevations (Start, or `start` "
+    "in robot.toml)",
     EDGE: "take a taller object, or one with upright sides",
     Miss.NO_TOUCH: "the fingers close beside the object: take a larger one, or contact points that "
     "close onto it",
@@ -70,7 +74,8 @@ class Start:
     Where a fingertip then meets an edge or an end face, the palm withdraws, moves along the
     vertical and turns about the approach axis, both so that this finger comes nearer the middle,
     and advances again. A draw is rejected where the arm cannot go, another link touches, or no
-    place of MAX_PLACES lets every fingertip touch the side. A hand without an arm is placed where
+    place of MAX_PLACES lets every fingertip touch the side; or where the robot's own links, if its
+    description keeps them apart, are in one another. A hand without an arm is placed where
     the draw says.
     """
 
@@ -110,6 +115,8 @@ class Start:
             return replace(self, **described).draw(scene, probe_in, rng)
         told: Counter[str] = Counter()
         kinds: Counter[Miss | str] = Counter()
+        least = robot.description.clearance
+        own = SelfClearance(robot, least) if least > 0.0 else None
         for rejected in range(self.max_draws):
             if rejected == ALIKE and len(kinds) == 1:
                 break
@@ -125,7 +132,10 @@ class Start:
                 places[g] = replace(place, distance=place.distance - nearer)
             found = self._first_touch(scene, probe_in, *hand, places)
             if not isinstance(found, _Rejected):
-                return FirstTouch(*found, rejected)
+                inside = () if own is None else own.collisions(found[1].q)
+                if not inside:
+                    return FirstTouch(*found, rejected)
+                found = _Rejected(OWN, f"{inside[0][0]} and {inside[0][1]} are in one another")
             told[found.told] += 1
             kinds[found.kind] += 1
         why = "; ".join(f"{count} {what}" for what, count in told.most_common(MOST_COMMON))

@@ -244,11 +244,6 @@ class Robot:
                     closing[i, self.index(joint)] = weight
             if closing[i].any():
                 closing[i] /= np.abs(closing[i] / unit).max()
-            elif not point.by_arm:
-                raise ModelError(
-                    f"flexion of {point.name!r} of {self.description.name} weighs no joint, so "
-                    'nothing can close it: flexion = { JOINT = 1.0 }, or "arm"'
-                )
         for i, point in enumerate(points):
             for j in np.flatnonzero(closing[i]):
                 others = [p.name for a, p in enumerate(points) if a != i and moves[a, j]]

@@ -16,6 +16,7 @@ from hqp_grasp.grasp import Grasp, Miss, Missed
 from hqp_grasp.hierarchy.hqp import HQP
 from hqp_grasp.tasks import ForceTask, KinematicTask, MomentTask
 from hqp_grasp.touch.geometric import GeometricProbe
+from hqp_grasp.world.clearance import SelfClearance
 from hqp_grasp.world.scene import Cylinder, Prism, Scene
 
 SEEDS = range(3)
@@ -469,3 +470,22 @@ def test_a_trial_may_begin_anywhere_and_stays_within_the_ranges(name):
     record = Trial(scene, stack, probes=12, start=grasp).run(0)
     assert len(record.grasps) > 1
     assert max(row["limit_violation"] for row in record.rows) == 0.0
+
+
+def test_a_draw_whose_arms_are_in_one_another_is_rejected():
+    scene = Scene("umass_torso", Cylinder(0.2, 0.4), hand="palms")
+    robot, rng = scene.articulated, np.random.default_rng(0)
+    own = SelfClearance(robot, robot.description.clearance)
+    good = first_touch(scene, GeometricProbe(scene), np.random.default_rng(1)).grasp
+    assert not own.collisions(good.q)
+    within = (rng.uniform(robot.q_lower, robot.q_upper) for _ in itertools.count())
+    crossed = robot.grasp(next(q for q in within if own.collisions(q)), good.contacts)
+    found = first_touch(scene, Told(crossed, then=good), np.random.default_rng(1))
+    assert found.grasp is good and found.rejected == 1
+    with pytest.raises(ReachError, match=r"are in one another\); move the object to"):
+        first_touch(scene, Told(then=crossed), np.random.default_rng(1), start_of(robot))
+
+
+def start_of(robot):
+    """The starts that a robot describes for its hand."""
+    return dataclasses.replace(Start(), **robot.description.hand.start)

@@ -205,7 +205,9 @@ def test_of_two_hands_the_one_with_more_fingers_is_described_and_they_are_not_mi
     assert data(text)["model"] == [{"file": "own.xml", "root": "palm"}]
 
 
-@pytest.mark.parametrize("name", ["allegro", "baxter", "fourier", "inspire", "robotiq", "shadow"])
+@pytest.mark.parametrize(
+    "name", ["allegro", "baxter", "fourier", "g1", "inspire", "robotiq", "shadow"]
+)
 def test_a_robot_by_name_whose_packages_are_missing_says_the_line_that_installs_them(
     name, monkeypatch
 ):
