@@ -98,6 +98,8 @@ bench: $(READY_BENCH)
 
 outside: $(READY_OUTSIDE)
 	$(PY) benchmarks/outside_robots.py
+	$(PY) benchmarks/outside_robots.py --only "g1 arms" --trials 100 --stacks fm fma
+	$(PY) benchmarks/outside_robots.py --only "baxter arms" --trials 100 --stacks fm fma
 	$(PY) benchmarks/outside_objects.py --pictures docs/images
 	$(PY) benchmarks/leaning.py --starts 20 --seed 71 --outside
 
