@@ -93,13 +93,13 @@ pictures: $(READY_ALL)
 	$(PY) docs/pictures.py
 
 bench: $(READY_BENCH)
-	@set -e; for file in $(filter-out benchmarks/mutants.py $(wildcard benchmarks/outside_*.py),$(wildcard benchmarks/*.py)); do \
+	@set -e; for file in $(filter-out benchmarks/mutants.py benchmarks/grid.py $(wildcard benchmarks/outside_*.py),$(wildcard benchmarks/*.py)); do \
 	  echo "$$file"; $(PY) "$$file"; done
 
 outside: $(READY_OUTSIDE)
 	$(PY) benchmarks/outside_robots.py
-	$(PY) benchmarks/outside_robots.py --only "g1 arms" --trials 100 --stacks fm fma
-	$(PY) benchmarks/outside_robots.py --only "baxter arms" --trials 100 --stacks fm fma
+	$(PY) benchmarks/outside_robots.py --only g1 --trials 100 --seed 5150
+	$(PY) benchmarks/outside_robots.py --only baxter --trials 100 --seed 5150
 	$(PY) benchmarks/outside_objects.py --pictures docs/images
 	$(PY) benchmarks/leaning.py --starts 20 --seed 71 --outside
 

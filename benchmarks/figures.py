@@ -19,7 +19,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import tyro
-from hqp_grasp.scenarios import cylinder, hexagon, irregular
+from grid import SCENES
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -27,7 +27,6 @@ from matplotlib.figure import Figure
 import hqp_grasp as hg
 from hqp_grasp.experiments.executor import run_all
 
-SCENES = {"cylinder": cylinder.scene, "hexagon": hexagon.scene, "irregular": irregular.scene}
 SETS = (("cylinder", "fm"), ("cylinder", "fmk"), ("hexagon", "fmk"), ("irregular", "fmk"))
 # What is drawn, and how each number is written.
 COLUMNS = {

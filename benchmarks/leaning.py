@@ -14,19 +14,17 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
+from grid import End, Runs, command
 from outside_objects import OBJECTS, scene_of
-from tqdm import tqdm
 
 import hqp_grasp as hg
-from hqp_grasp.experiments.executor import run_all
 from hqp_grasp.experiments.record import secures
 from hqp_grasp.mechanics import SECURE
 
+RUNS = Runs(50, 70)
 SIDES = 120  # of the polygon that stands for a circle
 HEIGHT = 0.12  # [m]
 RADIUS = 0.05  # [m] of a cup, half way up
@@ -78,75 +76,49 @@ def scene(name: str) -> hg.Scene:
     return scene_of(name) if name in OBJECTS else hg.Scene(object=body(name))
 
 
-@dataclass(frozen=True)
-class Work:
-    """The trials of each object, one after the other."""
-
-    names: tuple[str, ...]
-    starts: int
-    probes: int
-    seed: int
-
-    def __call__(self, number: int) -> tuple[str, bool, tuple[float, ...], str | None]:
-        """Verdict, whether secure by DEMAND, friction demand of each probe, why unbalanced."""
-        s, i = divmod(number, self.starts)
-        name = self.names[s]
-        record = hg.Trial(scene(name), hg.stack_of("fmk"), self.probes).attempt((self.seed, s, i))
-        demand = record.column("friction_demand")  # NaN where nothing was touched
-        return (
-            record.verdict,
-            secures(record.verdict_table(), limit(name))[0],
-            tuple(demand),
-            record.unbalanced,
-        )
+def holds(name: str, trial: hg.Trial, record: hg.Record) -> dict[str, float]:
+    """Whether friction holds the last grasp, or only one before it, and from which probe on."""
+    friction = DEMAND.get(name, SECURE)
+    held = record.column("friction_demand") <= friction  # False where nothing was touched
+    secure = secures(record.verdict_table(), friction)[0]
+    return {
+        "holds": float(secure),
+        "left": float(held.any() and not secure),
+        "first": float(held.argmax()) if held.any() else np.nan,
+        "kept": float(len(held) - np.append(~held[::-1], True).argmax()) if held[-1] else np.nan,
+    }
 
 
-def limit(name: str) -> float:
-    """The friction that has to hold the object of that name."""
-    return DEMAND.get(name, SECURE)
-
-
-def line(name: str, ends: list[tuple[str, bool, tuple[float, ...], str | None]]) -> str:
+def line(name: str, ends: list[End]) -> str:
     """One row of the table."""
-    good = sum(verdict == "good" for verdict, *_ in ends)
-    secure = sum(found for _, found, *_ in ends)
-    holds = [np.array(demand) <= limit(name) for _, _, demand, _ in ends]
-    first = [int(v.argmax()) for v in holds if v.any()]
-    stays = [len(v) - int(np.append(~v[::-1], True).argmax()) for v in holds if v[-1]]
-    left = sum(v.any() and not found for v, (_, found, *_) in zip(holds, ends, strict=True))
-    at = "".join(f"{np.median(v):9g}" if v else f"{'–':>9}" for v in (first, stays))
-    why = Counter(reason for *_, reason in ends if reason is not None).most_common(1)
-    told = f"{why[0][0]} ({why[0][1]})" if why else ""
-    return f"{name:11}{good:6}{secure:8}{left:8}{at}  {told}"
+    good = sum(end.verdict == "good" for end in ends)
+    own = {key: np.array([end.figures[key] for end in ends]) for key in ends[0].figures}
+    counts = "".join(f"{own[key].sum():8.0f}" for key in ("holds", "left"))
+    known = [own[key][~np.isnan(own[key])] for key in ("first", "kept")]
+    at = "".join(f"{np.median(v):9g}" if len(v) else f"{'–':>9}" for v in known)
+    why = Counter(end.why for end in ends if end.probe is None).most_common(1)
+    return f"{name:11}{good:6}{counts}{at}  {'{} ({})'.format(*why[0]) if why else ''}"
 
 
 def main(
-    starts: int = 50,
-    seed: int = 70,
-    probes: int = 40,
-    only: tuple[str, ...] = (),
-    outside: bool = False,
-    jobs: int = 2,
+    runs: Runs = RUNS, probes: int = 40, only: tuple[str, ...] = (), outside: bool = False
 ) -> None:
     """Print one line an object.
 
     Args:
-        starts: of each object
-        seed: trial i of object s draws from SeedSequence([seed, s, i])
+        runs: trials; trial i of object s draws from SeedSequence([seed, s, i])
         probes: touches after the first
         only: names of objects, in the place of all
         outside: groceries too
-        jobs: processes
     """
     names = only or (*CUPS, *CURVED, "lying", "cone", *(OBJECTS if outside else ()))
-    work = Work(names, starts, probes, seed)
-    numbers = range(len(names) * starts)
-    done = dict(tqdm(run_all(work, numbers, jobs), total=len(numbers)))
-    print(f"{starts} starts of each, {probes} probes, seed {seed}\n")
+    cells = {name: hg.Trial(scene(name), hg.stack_of("fmk"), probes) for name in names}
+    found = runs.of(cells, holds, apart=True)
+    print(f"{runs}, {probes} probes\n")
     print(f"{'':11}{'good':>6}{'secure':>8}{'left':>8}{'first':>9}{'kept':>9}  not balanced")
-    for s, name in enumerate(names):
-        print(line(name, [done[s * starts + i] for i in range(starts)]))
+    for name, ends in found.items():
+        print(line(name, ends))
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    command(main)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import tyro
-from hqp_grasp.scenarios import cylinder, cylinder_65, hexagon, irregular
+from grid import SCENES
 from tqdm import tqdm
 
 import hqp_grasp as hg
@@ -20,15 +20,6 @@ from hqp_grasp.experiments.executor import run_all
 from hqp_grasp.experiments.picking import PickSettings, pick_of
 from hqp_grasp.world.imperfections import Fault
 
-SCENES = {
-    name: module.scene
-    for name, module in (
-        ("cylinder", cylinder),
-        ("cylinder_65", cylinder_65),
-        ("hexagon", hexagon),
-        ("irregular", irregular),
-    )
-}
 SETTINGS = PickSettings(preset="loadcell")
 CONDITIONS = {
     "friction 0.4, 0.6 believed": replace(SETTINGS, friction=0.6, actual_friction=0.4),

@@ -3,22 +3,17 @@
     python benchmarks/polygons.py --polygons 20 --starts 50 --seed 0
     python benchmarks/polygons.py --shapes box_6 box_8 box_10 triangle pentagon octagon --starts 80
 
-A polygon has 5–8 sides, none under 2 cm, and holds a circle of 3–6 cm. "Good" is good in every
-respect: balanced to the last probe, never a link inside, no limit violated, no error.
+A polygon has 5–8 sides, none under 2 cm, and holds a circle of 3–6 cm.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass
-
 import numpy as np
-import tyro
-from tqdm import tqdm
+from grid import Runs, command, table
 
 import hqp_grasp as hg
-from hqp_grasp.experiments.executor import run_all
 
+RUNS = Runs(50, 0)
 SIDES = (5, 8)
 SHORTEST = 0.02  # [m]
 INRADIUS = (0.03, 0.06)  # [m]
@@ -59,71 +54,41 @@ def polygon(rng: np.random.Generator) -> hg.Prism:
             return hg.Prism(tuple(map(tuple, corners)))
 
 
-@dataclass(frozen=True)
-class Work:
-    """The trials of each object, one after the other."""
-
-    objects: tuple[hg.Cylinder | hg.Prism, ...]
-    trials: int
-    probes: int
-    seed: int
-    form: str
-
-    def __call__(self, number: int) -> tuple[str, int | None]:
-        """Verdict, and the probe from which it stays balanced."""
-        s, i = divmod(number, self.trials)
-        scene = hg.Scene(object=self.objects[s])
-        trial = hg.Trial(scene, hg.stack_of("fmk"), self.probes, self.form)
-        record = trial.attempt((self.seed, s, i))
-        return record.verdict, record.converged_at
+def quick(cell: str, trial: hg.Trial, record: hg.Record) -> dict[str, float]:
+    """Whether it stays balanced from probe QUICK on at the latest."""
+    return {"quick": float(record.converged_at is not None and record.converged_at <= QUICK)}
 
 
 def main(
+    runs: Runs = RUNS,
     shapes: tuple[str, ...] = (),
     polygons: int = 20,
-    starts: int = 50,
     probes: int = 40,
-    seed: int = 0,
     form: str = "hierarchy",
-    jobs: int = 2,
 ) -> None:
     """Print for each shape how many starts are good, how the others fail, and how many probes.
 
     Args:
+        runs: trials of each shape; the seed draws polygons too
         shapes: named shapes, in the place of random polygons
         polygons: random polygons, the i-th from SeedSequence([seed, i])
-        starts: of each shape
         probes: touches after the first one
-        seed: of polygons and starts
         form: of the controller
-        jobs: processes
     """
     objects = {name: NAMED[name] for name in shapes}
     if not shapes:
-        rngs = [np.random.default_rng((seed, i)) for i in range(polygons)]
+        rngs = [np.random.default_rng((runs.seed, i)) for i in range(polygons)]
         objects = {f"polygon {i}": polygon(rng) for i, rng in enumerate(rngs)}
-    work = Work(tuple(objects.values()), starts, probes, seed, form)
-    numbers = range(len(objects) * starts)
-    done = dict(tqdm(run_all(work, numbers, jobs), total=len(numbers)))
-    print(f"{'':14}{'good':>12}{'median':>8}{'p99':>6}{'worst':>7}{f'≤ {QUICK}':>7}  failures")
-    for s, name in enumerate(objects):
-        print(line(name, [done[s * starts + i] for i in range(starts)]))
-    print(line("all", list(done.values())))
-
-
-def line(name: str, ends: list[tuple[str, int | None]]) -> str:
-    """One row of the table."""
-    kinds = Counter(end for end, _ in ends)
-    good = kinds.pop("good", 0)
-    settled = [probe for _, probe in ends if probe is not None]
-    figures = "".join(f"{'–':>{w}}" for w in (8, 6, 7, 7))
-    if settled:
-        middle, high = np.percentile(settled, [50, 99])
-        quick = sum(probe <= QUICK for probe in settled)
-        figures = f"{middle:8.1f}{high:6.0f}{max(settled):7}{quick:7}"
-    failures = ", ".join(f"{count} {end}" for end, count in kinds.items())
-    return f"{name:14}{f'{good} of {len(ends)}':>12}{figures}  {failures}"
+    stack = hg.stack_of("fmk")
+    cells = {
+        name: hg.Trial(hg.Scene(object=thing), stack, probes, form)
+        for name, thing in objects.items()
+    }
+    found = runs.of(cells, quick, apart=True)
+    every = [end for ends in found.values() for end in ends]
+    print(table(found | {"all": every}))
+    print(f"\n{sum(end.figures['quick'] == 1.0 for end in every)} balanced within {QUICK} probes")
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    command(main)

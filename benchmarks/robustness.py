@@ -22,7 +22,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pyarrow as pa
 import tyro
-from hqp_grasp.scenarios import cylinder, cylinder_65, hexagon, irregular
+from grid import SCENES
 
 import hqp_grasp as hg
 from hqp_grasp.experiments.report import interval
@@ -31,12 +31,6 @@ from hqp_grasp.experiments.table import table_of
 from hqp_grasp.judge.judge import Judge
 from hqp_grasp.mechanics import friction_demand
 
-SCENES = {
-    "cylinder": cylinder.scene,
-    "cylinder_65": cylinder_65.scene,
-    "hexagon": hexagon.scene,
-    "irregular": irregular.scene,
-}
 # The kinematic law asks for a step of every joint, so what stands below it is never felt: fkm is
 # fk, mkf is mk, and all that begin with k are k.
 ORDERS = ["".join(p) for size in (1, 2, 3) for p in permutations("fmk", size) if "k" not in p[:-1]]
@@ -171,15 +165,6 @@ def _told(judge: Judge, grasp: hg.Grasp) -> dict[str, object]:
         "sum_normal": told.sum_normal,
         "weakest": told.weakest_axis,
         "twist": told.weakest_twist,
-    }
-
-
-def scenes() -> dict[str, hg.Scene]:
-    """The objects as their scenarios have them."""
-    from hqp_grasp.scenarios import cylinder, cylinder_65, hexagon, irregular
-
-    return {
-        m.__name__.rpartition(".")[2]: m.scene for m in (cylinder, cylinder_65, hexagon, irregular)
     }
 
 

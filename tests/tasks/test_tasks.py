@@ -644,6 +644,19 @@ def test_a_flexion_that_does_not_move_its_contact_is_a_named_case(g: int) -> Non
     assert np.abs(KinematicTask("eq7").jacobian(grasp)).max() == 0.0
 
 
+def test_of_several_contacts_the_one_that_its_flexion_does_not_move_is_named() -> None:
+    contacts = [
+        Contact(np.zeros(3), np.array([0.0, 0.0, 1.0]), name=f"tip_{i + 1}", flexion=(i,))
+        for i in range(3)
+    ]
+    J = np.zeros((9, 3))
+    J[[0, 6], [0, 2]] = 0.1  # the second joint moves nothing
+    with pytest.raises(
+        SingularTaskError, match=r"contact 1 \('tip_2'\): its flexion joints \(1,\)"
+    ):
+        KinematicTask("angle").error(Grasp(np.zeros(3), tuple(contacts), J))
+
+
 # ---------------------------------------------------------------- posture and contact
 
 

@@ -36,6 +36,15 @@ def touch(scene, physics=None, force=1.0, **settings):
     return hand, hg.PhysicalProbe(hand, scene.articulated, force).touch(POSTURE)
 
 
+def test_before_the_first_touch_no_time_has_passed_and_afterwards_it_is_the_hand_s(scene):
+    hand = hg.SimulatedHand(scene)
+    hand.place(POSTURE)
+    probe = hg.PhysicalProbe(hand, scene.articulated)
+    assert probe.time == -np.inf
+    probe.touch(POSTURE)
+    assert probe.time == pytest.approx(hand.wait(0.0).time[-1], abs=0.01)
+
+
 def degrees(a, b):
     return np.degrees(2.0 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2.0))
 
